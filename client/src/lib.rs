@@ -1,0 +1,1 @@
+//! Draws streamed terrain.

@@ -1,0 +1,1 @@
+//! Geometry, encodings and messages shared by server and client.

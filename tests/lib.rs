@@ -1,0 +1,1 @@
+//! End-to-end tests of Diamantina live in this package; see `e2e.rs`.
