@@ -1,0 +1,317 @@
+//! Diamonds: the triangles that share a hypotenuse, split as one and travel as one.
+//!
+//! A diamond is named by its centre, the middle of the hypotenuse, whose coordinates alone tell its
+//! level: with `h` the largest power of two that divides both, the centre of an even level has both
+//! `x/h` and `y/h` odd, that of an odd level just one. Its parents are the diamonds whose centres are
+//! its own apexes, and its children those centred at the middles of its sides: the graph is arithmetic,
+//! there is nothing to store.
+//!
+//! **The local grid.** A diamond of n segments a side has (n+1)^2 *old* points, known before it splits,
+//! and n^2 *new* ones, the centres of its cells, which its split adds. In local coordinates (u, v) the
+//! hypotenuse runs from `a` = (0, 0) to `b` = (n, n), and the apexes are (n, 0) and (0, n):
+//!
+//! ```text
+//!   v                      The triangle below the diagonal always lies inside the forest; a diamond
+//!   n +-----3-----b        at the border may lack the one above. Sides are numbered 0 to 3, and
+//!     |         / |        triangle q of the split has side q as its hypotenuse and the diamond's
+//!     4  upper/   2        centre as its apex. (In the picture they are 1 to 4.)
+//!     |     /     |
+//!     |   /       |        Splitting changes only points strictly inside. So a side carries the same
+//!     | /  lower  |        heights in both diamonds that share it, at whatever level each stands:
+//!     a-----1-----+  u     there are no cracks.
+//! ```
+//!
+//! After Cignoni et al., *BDAM: Batched Dynamic Adaptive Meshes* (2003), and Gobbetti et al., *C-BDAM*
+//! (2006), whose diamonds these are.
+
+use crate::NODATA;
+use crate::bintree::{Forest, Point};
+
+/// A diamond of a forest: a checked centre with its level.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Diamond {
+    level: u8,
+    y: u32,
+    x: u32,
+}
+
+/// Where a diamond's local grid lies on the lattice.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Local {
+    /// The point (0, 0): one end of the hypotenuse.
+    pub origin: [i64; 2],
+    /// The lattice step of one unit of u.
+    pub u: [i64; 2],
+    /// The lattice step of one unit of v: `u` turned left.
+    pub v: [i64; 2],
+    /// Whether the triangle above the diagonal lies in the forest.
+    pub upper: bool,
+    n: i64,
+}
+
+impl Forest {
+    /// The diamond with this centre, or `None` where no diamond of a level that splits is centred.
+    #[must_use]
+    pub fn diamond(&self, [x, y]: Point) -> Option<Diamond> {
+        if !self.contains([x, y]) {
+            return None;
+        }
+        let zeros = (x | y).trailing_zeros();
+        if zeros >= self.root_log2() {
+            return None;
+        }
+        let both_odd = (x >> zeros) & (y >> zeros) & 1 == 1;
+        let level = 2 * (self.root_log2() - 1 - zeros) + u32::from(!both_odd);
+        (level < self.levels()).then(|| Diamond { level: u8::try_from(level).unwrap_or(u8::MAX), x, y })
+    }
+
+    /// The diamonds of level 0, one a root square, south row first.
+    pub fn root_diamonds(&self) -> impl Iterator<Item = Diamond> + use<> {
+        let half = 1u32 << (self.root_log2() - 1);
+        let [columns, rows] = self.roots();
+        (0..rows).flat_map(move |j| {
+            (0..columns).map(move |i| Diamond { level: 0, x: (2 * i + 1) * half, y: (2 * j + 1) * half })
+        })
+    }
+
+    /// The ends of the hypotenuse `[a, b]` and the apexes `[lower, upper]`, which may lie outside.
+    fn frame(&self, d: Diamond) -> ([[i64; 2]; 2], [[i64; 2]; 2]) {
+        let h = 1i64 << (self.root_log2() - 1 - u32::from(d.level) / 2);
+        let (x, y) = (i64::from(d.x), i64::from(d.y));
+        if d.level % 2 == 0 {
+            // Diagonals of the squares alternate: they join points whose coordinates, in squares, sum to
+            // an even number.
+            if (d.x / (2 * h as u32) + d.y / (2 * h as u32)) % 2 == 0 {
+                ([[x - h, y - h], [x + h, y + h]], [[x + h, y - h], [x - h, y + h]])
+            } else {
+                ([[x + h, y - h], [x - h, y + h]], [[x + h, y + h], [x - h, y - h]])
+            }
+        } else if (x / h) % 2 == 1 {
+            ([[x - h, y], [x + h, y]], [[x, y - h], [x, y + h]])
+        } else {
+            ([[x, y - h], [x, y + h]], [[x + h, y], [x - h, y]])
+        }
+    }
+
+    fn inside(&self, [x, y]: [i64; 2]) -> bool {
+        let [w, h] = self.size();
+        (0..=i64::from(w)).contains(&x) && (0..=i64::from(h)).contains(&y)
+    }
+
+    /// The diamond's local grid. Where only one triangle lies in the forest, it is the lower one.
+    #[must_use]
+    pub fn local(&self, d: Diamond) -> Local {
+        let ([mut a, mut b], [mut lower, mut upper]) = self.frame(d);
+        if !self.inside(lower) {
+            (a, b) = (b, a);
+            (lower, upper) = (upper, lower);
+        }
+        let n = 1i64 << self.patch_log2();
+        let u = [(lower[0] - a[0]) / n, (lower[1] - a[1]) / n];
+        let v = [(b[0] - lower[0]) / n, (b[1] - lower[1]) / n];
+        Local { origin: a, u, v, upper: self.inside(upper), n }
+    }
+
+    /// The diamonds whose splits give this one its triangles: none at level 0, one at the border, else two.
+    pub fn parents(&self, d: Diamond) -> impl Iterator<Item = Diamond> + use<> {
+        let forest = *self;
+        let apexes = if d.level == 0 { None } else { Some(self.frame(d).1) };
+        apexes.into_iter().flatten().filter(move |p| forest.inside(*p)).filter_map(move |p| forest.at(p))
+    }
+
+    /// The diamond centred at the middle of each side, or `None` where the side's triangle is outside of
+    /// the forest or splits no further.
+    #[must_use]
+    pub fn children(&self, d: Diamond) -> [Option<Diamond>; 4] {
+        let local = self.local(d);
+        std::array::from_fn(|side| {
+            if side > 1 && !local.upper {
+                return None;
+            }
+            self.at(local.lattice2(SIDE_MIDDLES[side].map(|w| w * local.n)))
+        })
+    }
+
+    fn at(&self, [x, y]: [i64; 2]) -> Option<Diamond> {
+        self.diamond([u32::try_from(x).ok()?, u32::try_from(y).ok()?])
+    }
+
+    /// Lattice coordinates of the box around a diamond, clipped to the forest: south-west, north-east.
+    #[must_use]
+    pub fn bounds(&self, d: Diamond) -> [Point; 2] {
+        let ([a, b], [c, e]) = self.frame(d);
+        let [w, h] = self.size();
+        let clip = |value: i64, max: u32| u32::try_from(value.clamp(0, i64::from(max))).unwrap_or(0);
+        let x = [a[0], b[0], c[0], e[0]];
+        let y = [a[1], b[1], c[1], e[1]];
+        let least = |values: [i64; 4]| values.into_iter().fold(i64::MAX, i64::min);
+        let most = |values: [i64; 4]| values.into_iter().fold(i64::MIN, i64::max);
+        [[clip(least(x), w), clip(least(y), h)], [clip(most(x), w), clip(most(y), h)]]
+    }
+
+    /// Every diamond of a level, in row order. `level` below [`Forest::levels`].
+    pub fn diamonds(&self, level: u32) -> impl Iterator<Item = Diamond> + use<> {
+        let forest = *self;
+        let h = 1u32 << (self.root_log2() - 1 - level / 2);
+        let [w, height] = self.size();
+        let (columns, rows) = (w / h, height / h);
+        (0..=rows).flat_map(move |j| {
+            (0..=columns).filter_map(move |i| {
+                let fits = if level % 2 == 0 { i % 2 == 1 && j % 2 == 1 } else { i % 2 != j % 2 };
+                if fits { forest.diamond([i * h, j * h]).filter(|d| d.level() == level) } else { None }
+            })
+        })
+    }
+
+    /// The largest length of a micro-hypotenuse of triangles of a level, in units of the shorter and
+    /// longer cell alike: lattice steps along x and y of the longer one. Level may be [`Forest::levels`].
+    #[must_use]
+    pub fn hypotenuse(&self, level: u32) -> [f64; 2] {
+        let spacing = f64::from(1u32 << (self.root_log2() - self.patch_log2() - level / 2));
+        // An odd level's cells are turned by 45 degrees: their hypotenuse lies along one axis.
+        if level % 2 == 0 { [spacing, spacing] } else { [spacing, 0.0] }
+    }
+}
+
+/// Middles of the sides, in units of n, in doubled local coordinates.
+const SIDE_MIDDLES: [[i64; 2]; 4] = [[1, 0], [2, 1], [1, 2], [0, 1]];
+
+impl Diamond {
+    /// The diamond's level: 0 for a root square.
+    #[must_use]
+    pub fn level(self) -> u32 {
+        u32::from(self.level)
+    }
+
+    /// The centre, in lattice coordinates: the diamond's name.
+    #[must_use]
+    pub fn centre(self) -> Point {
+        [self.x, self.y]
+    }
+}
+
+impl Local {
+    /// The lattice point of doubled local coordinates (2u, 2v): both even for an old point, both odd
+    /// for a new one.
+    #[must_use]
+    pub fn lattice2(&self, [p, q]: [i64; 2]) -> [i64; 2] {
+        [
+            self.origin[0] + (self.u[0] * p + self.v[0] * q) / 2,
+            self.origin[1] + (self.u[1] * p + self.v[1] * q) / 2,
+        ]
+    }
+
+    /// The doubled local coordinates of a lattice point.
+    #[must_use]
+    pub fn local2(&self, [x, y]: [i64; 2]) -> [i64; 2] {
+        let w = [x - self.origin[0], y - self.origin[1]];
+        let length2 = self.u[0] * self.u[0] + self.u[1] * self.u[1];
+        let along = |e: [i64; 2]| 2 * (w[0] * e[0] + w[1] * e[1]) / length2;
+        [along(self.u), along(self.v)]
+    }
+}
+
+/// The heights of a diamond once it is split: old points and new ones, in quanta.
+///
+/// Takes `4 ((n+1)^2 + n^2)` bytes: 33 kB for n = 64.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Block {
+    n: usize,
+    heights: Vec<i32>,
+}
+
+impl Block {
+    /// A block without heights.
+    #[must_use]
+    pub fn empty(forest: &Forest) -> Self {
+        let n = forest.segments();
+        Self { n, heights: vec![NODATA; (n + 1) * (n + 1) + n * n] }
+    }
+
+    /// Segments a side.
+    #[must_use]
+    pub fn segments(&self) -> usize {
+        self.n
+    }
+
+    /// Old points, rows of n+1 along u, then new points, rows of n.
+    #[must_use]
+    pub fn heights(&self) -> &[i32] {
+        &self.heights
+    }
+
+    /// The old points, row v after row v, each of n+1 heights; and the new ones, rows of n.
+    pub fn parts_mut(&mut self) -> (&mut [i32], &mut [i32]) {
+        self.heights.split_at_mut((self.n + 1) * (self.n + 1))
+    }
+
+    /// The old points and the new ones.
+    #[must_use]
+    pub fn parts(&self) -> (&[i32], &[i32]) {
+        self.heights.split_at((self.n + 1) * (self.n + 1))
+    }
+
+    /// Position in [`Block::heights`] of doubled local coordinates, both even or both odd, in 0..=2n.
+    #[must_use]
+    pub fn slot(n: usize, p: usize, q: usize) -> usize {
+        if p % 2 == 0 { q / 2 * (n + 1) + p / 2 } else { (n + 1) * (n + 1) + q / 2 * n + p / 2 }
+    }
+
+    /// Fills in, from `parent`'s split, the old points of `child` that lie in the triangle they share.
+    ///
+    /// Both parents together give a child all its old points; those on the shared hypotenuse come from
+    /// either, and are equal, since no split moves its own border.
+    pub fn inherit(&mut self, forest: &Forest, child: Diamond, parent: Diamond, from: &Self) {
+        walk_shared(forest, child, parent, |to, slot| self.heights[to] = from.heights[slot]);
+    }
+
+    /// Reads every point of the block from the lattice: `height(x, y)`. Points outside stay empty.
+    pub fn fill(&mut self, local: &Local, mut height: impl FnMut(u32, u32) -> i32) {
+        let n = self.n as i64;
+        let side = self.n + 1;
+        for v in 0..=n {
+            for u in 0..=if local.upper { n } else { n } {
+                if !local.upper && v > u {
+                    continue;
+                }
+                let [x, y] = local.lattice2([2 * u, 2 * v]);
+                self.heights[v as usize * side + u as usize] = height(x as u32, y as u32);
+            }
+        }
+        for v in 0..n {
+            for u in 0..n {
+                if !local.upper && v > u {
+                    continue;
+                }
+                let [x, y] = local.lattice2([2 * u + 1, 2 * v + 1]);
+                self.heights[side * side + v as usize * self.n + u as usize] = height(x as u32, y as u32);
+            }
+        }
+    }
+}
+
+/// Calls `copy(slot of the child's old point, slot in the parent's block)` for each point of the
+/// triangle that `child` takes from `parent`.
+pub fn walk_shared(forest: &Forest, child: Diamond, parent: Diamond, mut copy: impl FnMut(usize, usize)) {
+    let n = forest.segments();
+    let (c, p) = (forest.local(child), forest.local(parent));
+    // The child's local grid seen from the parent's: a turn by an odd multiple of 45 degrees.
+    let origin = p.local2(c.origin);
+    let along = |e: [i64; 2]| {
+        let tip = p.local2([c.origin[0] + e[0] * n as i64, c.origin[1] + e[1] * n as i64]);
+        [(tip[0] - origin[0]) / n as i64, (tip[1] - origin[1]) / n as i64]
+    };
+    let (u, v) = (along(c.u), along(c.v));
+    let centre = [i64::from(parent.x), i64::from(parent.y)];
+    let lower = c.lattice2([2 * n as i64, 0]) == centre;
+    for j in 0..=n {
+        let (from, to) = if lower { (j, n) } else { (0, j) };
+        for i in from..=to {
+            let q = [
+                origin[0] + u[0] * i as i64 + v[0] * j as i64,
+                origin[1] + u[1] * i as i64 + v[1] * j as i64,
+            ];
+            copy(j * (n + 1) + i, Block::slot(n, q[0] as usize, q[1] as usize));
+        }
+    }
+}
