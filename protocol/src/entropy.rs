@@ -37,7 +37,13 @@ impl Context {
     #[allow(clippy::cast_possible_truncation, reason = "at most 65535, since part is at most whole")]
     pub const fn likely(part: u64, whole: u64) -> Self {
         let zero = part * 65535 / whole;
-        let zero = if zero < 1000 { 1000 } else if zero > 64535 { 64535 } else { zero };
+        let zero = if zero < 1000 {
+            1000
+        } else if zero > 64535 {
+            64535
+        } else {
+            zero
+        };
         Self { zero: zero as u16, seen: 0 }
     }
 

@@ -1,1 +1,374 @@
-//! x
+//! What crosses the wire besides geometry: routes, the catalogue, and the frames of a batch.
+//!
+//! Routes are written and read here only, so that client and server cannot drift apart. The catalogue is
+//! JSON (people read it); a batch is a sequence of frames, each a header and a payload.
+
+use crate::bintree::{Forest, Point};
+use crate::points::Coding;
+use crate::wire::{self, WireError};
+use serde::{Deserialize, Serialize};
+use std::fmt::Write as _;
+
+/// Most diamonds in one batch; their names keep the request line below 8 kB.
+pub const BATCH_MAX: usize = 384;
+
+/// The longest request target that a client sends and a server must take, in bytes.
+pub const TARGET_BYTES_MAX: usize = 8000;
+
+/// The largest payload of a diamond, in bytes: every point of the largest block at 32 bits.
+pub const PAYLOAD_BYTES_MAX: u32 = 256 << 10;
+
+/// A list of scenes: the answer to `GET /scenes`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Catalogue {
+    /// The scenes that this server offers.
+    pub scenes: Vec<Scene>,
+}
+
+/// A scene: one frame and its layers. The answer to `GET /scenes/{scene}`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Scene {
+    /// The name in the address: letters, digits, `-`, `_` and `.`.
+    pub name: String,
+    /// A hash of the content: everything under it never changes.
+    pub version: String,
+    /// The planar coordinate system.
+    pub frame: Frame,
+    /// The surfaces over the frame.
+    pub layers: Vec<Layer>,
+    /// Names of the regions with a visibility mask.
+    #[serde(default)]
+    pub zones: Vec<String>,
+}
+
+/// The planar coordinate system of a scene. Coordinates are metres, x east, y north, heights up.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Frame {
+    /// The coordinate reference system, if it is known.
+    pub crs: Option<Crs>,
+    /// Unit of heights; always "metre" so far.
+    pub vertical_unit: String,
+}
+
+/// A coordinate reference system, and how a layer's lattice lies in it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Crs {
+    /// For example "EPSG:32611".
+    pub name: String,
+    /// The definition as a PROJ string, if it has one.
+    pub proj4: Option<String>,
+    /// Coordinates, in the system's own units, of frame coordinates (0, 0).
+    pub origin: [f64; 2],
+    /// Units of the system (metres, feet or degrees) for a metre of the frame, along x and y.
+    pub per_metre: [f64; 2],
+}
+
+/// What a layer is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Kind {
+    /// Solid ground.
+    Terrain,
+    /// A water surface.
+    Water,
+}
+
+/// A surface over the frame.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Layer {
+    /// The name in the address.
+    pub name: String,
+    /// Terrain or water.
+    pub kind: Kind,
+    /// The root squares and patches.
+    pub forest: Forest,
+    /// Frame coordinates of lattice point (0, 0), in metres.
+    pub origin: [f64; 2],
+    /// Metres of a lattice step along x and y.
+    pub cell: [f64; 2],
+    /// Samples of the source along x and y; the rest of the forest has no heights.
+    pub samples: [u32; 2],
+    /// Samples that have a height.
+    pub valid_samples: u64,
+    /// Metres of one quantum: a height is `quantum * integer + height_offset`.
+    pub quantum: f64,
+    /// Metres added to every height.
+    pub height_offset: f64,
+    /// The lowest and highest height, in metres.
+    pub heights: [f64; 2],
+    /// The error that was asked of the finest level, in metres: 0 is lossless.
+    pub max_error: f64,
+    /// The largest error, in metres, of what is drawn where every diamond is split.
+    pub finest_error: f32,
+    /// Encodings offered: "points".
+    pub encodings: Vec<String>,
+    /// How `points` payloads are coded.
+    pub coding: Coding,
+    /// Bytes of all payloads and index pages.
+    pub bytes: u64,
+    /// Whether heights were interpolated to the frame's grid.
+    pub resampled: bool,
+    /// How errors were found: "exact" if each sample was compared at each level.
+    pub errors: String,
+}
+
+impl Layer {
+    /// Frame coordinates of a lattice point, in metres.
+    #[must_use]
+    pub fn position(&self, [x, y]: Point) -> [f64; 2] {
+        [self.origin[0] + self.cell[0] * f64::from(x), self.origin[1] + self.cell[1] * f64::from(y)]
+    }
+
+    /// A height in metres.
+    #[must_use]
+    pub fn metres(&self, height: i32) -> f64 {
+        f64::from(height) * self.quantum + self.height_offset
+    }
+}
+
+/// The answer to a request for a height.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct HeightAnswer {
+    /// Frame coordinates, in metres.
+    pub x: f64,
+    /// Frame coordinates, in metres.
+    pub y: f64,
+    /// Degrees east and north, where the frame's system is known.
+    pub lon: Option<f64>,
+    /// See `lon`.
+    pub lat: Option<f64>,
+    /// Metres; none where the source has no data.
+    pub height: Option<f64>,
+    /// The height differs from the source by at most this many metres.
+    pub error: f64,
+    /// Whether the source has no data here.
+    pub nodata: bool,
+}
+
+/// A problem, as RFC 9457 writes it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Problem {
+    /// A short name of the kind of problem.
+    pub title: String,
+    /// The HTTP status.
+    pub status: u16,
+    /// What was wrong and what to do.
+    pub detail: String,
+}
+
+/// Whether a name may stand in an address and in a path: 1 to 64 of `[A-Za-z0-9._-]`, not starting with
+/// a dot.
+#[must_use]
+pub fn is_name(text: &str) -> bool {
+    (1..=64).contains(&text.len())
+        && !text.starts_with('.')
+        && text.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
+}
+
+/// The path of a scene's description.
+#[must_use]
+pub fn scene_route(scene: &str) -> String {
+    format!("/scenes/{scene}")
+}
+
+/// The path of a page of the index.
+#[must_use]
+pub fn index_route(scene: &str, version: &str, layer: &str, page: u32) -> String {
+    format!("/scenes/{scene}/{version}/{layer}/index/{page}")
+}
+
+/// The path of one diamond.
+#[must_use]
+pub fn points_route(scene: &str, version: &str, layer: &str, [x, y]: Point) -> String {
+    format!("/scenes/{scene}/{version}/{layer}/points/{x}/{y}")
+}
+
+/// The path and query of a batch of diamonds.
+#[must_use]
+pub fn batch_route(scene: &str, version: &str, layer: &str, centres: &[Point]) -> String {
+    let mut route = format!("/scenes/{scene}/{version}/{layer}/points?d=");
+    for (i, [x, y]) in centres.iter().enumerate() {
+        // Writing to a String cannot fail.
+        let _ = write!(route, "{}{x},{y}", if i == 0 { "" } else { ";" });
+    }
+    route
+}
+
+/// Why text is not a list of diamonds.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum BatchError {
+    /// Not `x,y;x,y;...`.
+    #[error("'{0}' is not a centre: expected d=x,y;x,y;... with whole numbers")]
+    Syntax(String),
+    /// Too many.
+    #[error("more than {BATCH_MAX} diamonds in one request: send several")]
+    Many,
+}
+
+/// The centres in the query `d=x,y;x,y;...`. The text may be hostile.
+///
+/// # Errors
+/// When it is not such a list, or too long.
+pub fn parse_batch(text: &str) -> Result<Vec<Point>, BatchError> {
+    let mut list = Vec::new();
+    for item in text.split(';') {
+        if list.len() == BATCH_MAX {
+            return Err(BatchError::Many);
+        }
+        let centre = item.split_once(',').and_then(|(x, y)| Some([whole(x)?, whole(y)?]));
+        let shown: String = item.chars().take(24).collect();
+        list.push(centre.ok_or(BatchError::Syntax(shown))?);
+    }
+    Ok(list)
+}
+
+/// A number in plain decimal digits.
+fn whole(text: &str) -> Option<u32> {
+    text.bytes().all(|b| b.is_ascii_digit()).then(|| text.parse().ok())?
+}
+
+/// What a frame of a batch says of its diamond.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Status {
+    /// The payload follows.
+    Ok,
+    /// There is no such diamond, or it has no payload.
+    Missing,
+    /// The store's copy is damaged.
+    Damaged,
+}
+
+/// One diamond of a batch.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FrameHeader {
+    /// The diamond's centre.
+    pub centre: Point,
+    /// What follows.
+    pub status: Status,
+    /// Bytes that follow.
+    pub length: u32,
+    /// The low half of the payload's XXH3.
+    pub checksum: u32,
+}
+
+/// The most bytes that a header takes.
+pub const FRAME_HEADER_BYTES_MAX: usize = 21;
+
+/// The checksum of a payload on the wire: the low half of XXH3.
+#[must_use]
+#[allow(clippy::cast_possible_truncation, reason = "the low half is what is wanted")]
+pub fn checksum(payload: &[u8]) -> u32 {
+    xxhash_rust::xxh3::xxh3_64(payload) as u32
+}
+
+impl FrameHeader {
+    /// The header of a payload.
+    #[must_use]
+    pub fn of(centre: Point, payload: &[u8]) -> Self {
+        let length = u32::try_from(payload.len()).unwrap_or(u32::MAX);
+        Self { centre, status: Status::Ok, length, checksum: checksum(payload) }
+    }
+
+    /// The header of a diamond that cannot be sent.
+    #[must_use]
+    pub fn without(centre: Point, status: Status) -> Self {
+        Self { centre, status, length: 0, checksum: checksum(&[]) }
+    }
+
+    /// Appends the header's bytes.
+    pub fn write(&self, out: &mut Vec<u8>) {
+        let status = match self.status {
+            Status::Ok => 0u8,
+            Status::Missing => 1,
+            Status::Damaged => 2,
+        };
+        out.extend(wire::to_bytes(&(self.centre, status, self.length, self.checksum)));
+    }
+
+    /// The header in front of `bytes` and its length; `None` when more bytes are needed. They may be
+    /// hostile.
+    ///
+    /// # Errors
+    /// When no header starts so.
+    pub fn read(bytes: &[u8]) -> Result<Option<(Self, usize)>, WireError> {
+        type Fields = (Point, u8, u32, u32);
+        let ((centre, status, length, checksum), used) = match wire::from_prefix::<64, Fields>(bytes) {
+            Ok(read) => read,
+            Err(_) if bytes.len() < FRAME_HEADER_BYTES_MAX => return Ok(None),
+            Err(e) => return Err(e),
+        };
+        let status = match status {
+            0 => Status::Ok,
+            1 => Status::Missing,
+            2 => Status::Damaged,
+            other => return Err(WireError::Damaged(format!("status {other}"))),
+        };
+        if length > PAYLOAD_BYTES_MAX {
+            return Err(WireError::Damaged(format!("payload of {length} bytes, limit {PAYLOAD_BYTES_MAX}")));
+        }
+        Ok(Some((Self { centre, status, length, checksum }, used)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn a_batch_request_comes_back(centres in prop::collection::vec(any::<[u32; 2]>(), 1..BATCH_MAX)) {
+            let route = batch_route("s", "v", "terrain", &centres);
+            prop_assert_eq!(parse_batch(route.split_once("d=").unwrap().1), Ok(centres));
+        }
+
+        #[test]
+        fn a_frame_comes_back(x in any::<u32>(), y in any::<u32>(), payload in prop::collection::vec(any::<u8>(), 0..50)) {
+            let header = FrameHeader::of([x, y], &payload);
+            let mut bytes = Vec::new();
+            header.write(&mut bytes);
+            prop_assert!(bytes.len() <= FRAME_HEADER_BYTES_MAX);
+            for cut in 0..bytes.len() {
+                prop_assert_eq!(FrameHeader::read(&bytes[..cut]), Ok(None));
+            }
+            let used = bytes.len();
+            bytes.extend(payload);
+            prop_assert_eq!(FrameHeader::read(&bytes), Ok(Some((header, used))));
+        }
+
+        #[test]
+        fn any_text_is_a_batch_or_an_error(text in ".{0,60}") { let _ = parse_batch(&text); }
+
+        #[test]
+        fn any_bytes_are_a_frame_or_an_error(bytes in prop::collection::vec(any::<u8>(), 0..40)) {
+            if let Ok(Some((header, _))) = FrameHeader::read(&bytes) { prop_assert!(header.length <= PAYLOAD_BYTES_MAX); }
+        }
+    }
+
+    #[test]
+    fn wrong_batches_are_named() {
+        assert_eq!(parse_batch("1,2;3"), Err(BatchError::Syntax("3".into())));
+        assert_eq!(parse_batch("+1,2"), Err(BatchError::Syntax("+1,2".into())));
+        assert_eq!(parse_batch(&vec!["1,2"; BATCH_MAX + 1].join(";")), Err(BatchError::Many));
+    }
+
+    #[test]
+    fn names_cannot_be_paths() {
+        assert!(is_name("alps-2.v1_x"));
+        for bad in ["", ".", "..", "a/b", "a b", "ä", ".hidden", &"x".repeat(65)] {
+            assert!(!is_name(bad), "{bad}");
+        }
+    }
+
+    #[test]
+    fn a_full_batch_fits_a_request_line() {
+        // The longest centres of a layer of 2^17 cells: six digits each.
+        let route = batch_route(
+            &"s".repeat(64),
+            &"v".repeat(32),
+            &"l".repeat(64),
+            &vec![[131_072, 131_072]; BATCH_MAX],
+        );
+        assert!(route.len() <= TARGET_BYTES_MAX, "{}", route.len());
+    }
+}
