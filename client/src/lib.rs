@@ -1,1 +1,4 @@
 //! Draws streamed terrain.
+
+pub mod camera;
+pub mod surface;
