@@ -34,7 +34,7 @@ pub struct Entry {
     pub low: i32,
     /// See `low`.
     pub high: i32,
-    /// Bytes of the payload; 0: no point is added here nor anywhere below.
+    /// Bytes of the payload; 0: the split adds no height (there may be some further below).
     pub bytes: u32,
 }
 

@@ -249,19 +249,20 @@ pub enum DecodeError {
 ///
 /// `block` holds the reconstructed old points (except at level 0, where they are coded too); `source`
 /// is the whole block of source heights, at most [`SOURCE_MAX`] in magnitude, with [`NODATA`] wherever
-/// the block has none. Returns the payload, and empty bytes where no new point has a height: such a
-/// diamond has no payload.
+/// the block has none. Returns the payload, and empty bytes where no new point has a height and no old
+/// one is to be corrected: such a diamond has no payload.
 #[must_use]
 pub fn encode(forest: &Forest, coding: &Coding, d: Diamond, block: &mut Block, source: &Block) -> Vec<u8> {
     let root = d.level() == 0;
     let (old, new) = source.parts();
     let upper = forest.local(d).upper;
     let n = forest.segments();
-    let exists = |i: usize, row: usize| upper || i % row <= i / row;
-    let mut valid = new.iter().enumerate().filter(|(i, _)| exists(*i, n)).map(|(_, h)| *h != NODATA);
+    let mut valid = (0..n * n).filter(|i| upper || i % n >= i / n).map(|i| new[i] != NODATA);
     let mut valid_old = old.iter().map(|h| *h != NODATA);
-    // Nothing to add, and, since nothing is drawn inside, nothing to correct.
-    if valid.clone().all(|v| !v) && (!root || valid_old.clone().all(|v| !v)) {
+    if valid.clone().all(|v| !v)
+        && !has_corrections(coding, d.level(), upper, block)
+        && (!root || valid_old.clone().all(|v| !v))
+    {
         block.parts_mut().1.fill(NODATA);
         return Vec::new();
     }
@@ -285,7 +286,7 @@ pub fn quantise(forest: &Forest, coding: &Coding, d: Diamond, block: &mut Block,
 /// Completes `block`, which holds the old points of `d` (none at level 0), from a payload.
 ///
 /// The bytes may be hostile. Takes no memory beyond the block but some tens of kilobytes, and time in
-/// proportion to the block's points. Empty bytes mean that no new point has a height.
+/// proportion to the block's points. Empty bytes mean that no new point has a height and no old one moves.
 ///
 /// # Errors
 /// When the bytes are no payload of this format; `block` is then of no use.
@@ -536,6 +537,19 @@ fn walk_root<P: Pass>(
         side = half;
     }
     Ok(())
+}
+
+/// Whether the split says something of an old point.
+fn has_corrections(coding: &Coding, level: u32, upper: bool, block: &Block) -> bool {
+    let n = block.segments();
+    let (old, _) = block.parts();
+    (1..n).any(|v| {
+        (if upper { 1 } else { v }..n).any(|u| {
+            let place = place(n, 2 * u, 2 * v);
+            old[v * (n + 1) + u] != NODATA
+                && coding.exponent_before(level, place) > coding.exponent(level, place)
+        })
+    })
 }
 
 /// Corrections of the old points strictly inside, row by row.
