@@ -1,0 +1,487 @@
+//! A scene on disk: packed blobs found by key. It knows no geometry.
+//!
+//! ```text
+//! STORE/scene.json               what the scene is; names the version; replaced atomically
+//! STORE/<version>/directory      where each blob lies, sorted by key
+//! STORE/<version>/pack-00000     blobs in the order in which a viewer descends
+//! STORE/.lock                    held by the one build that may write
+//! STORE/.building                a build's work folder; swept by the next build
+//! ```
+//!
+//! `<version>` is a hash of the directory (which holds every blob's checksum) and of the scene, so any
+//! change of content changes it, and opening a store checks both. A build writes the version's folder,
+//! syncs it, and only then renames a new `scene.json` over the old one: whoever opens the store finds
+//! the old scene or the new one. The disk is assumed to keep what it was asked to sync.
+//!
+//! The directory is little-endian:
+//!
+//! | offset | size | field | valid range |
+//! |---|---|---|---|
+//! | 0 | 8 | magic | `DMTDIR01` |
+//! | 8 | 4 | entries | as many as follow |
+//! | 12 + 32 i | 1 + 1 + 2 | layer, kind, 0 | |
+//! | 16 + 32 i | 4 + 4 | two numbers that complete the key | |
+//! | 24 + 32 i | 4 | pack | below the number of packs |
+//! | 28 + 32 i | 4 + 4 | offset in the pack, bytes | inside the pack |
+//! | 36 + 32 i | 8 | XXH3 of the blob | |
+
+use bytes::Bytes;
+use diamantina_protocol::message::Scene;
+use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
+use std::os::unix::fs::FileExt;
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use xxhash_rust::xxh3::xxh3_64;
+
+/// The format that this build writes, and the only one that it reads.
+pub const FORMAT: u32 = 1;
+
+/// A pack is closed once it holds this many bytes.
+const PACK_BYTES: u64 = 32 << 20;
+
+/// The largest blob, in bytes; a key that claims more is damaged.
+const BLOB_BYTES_MAX: u32 = 16 << 20;
+
+/// The largest `scene.json`, in bytes.
+const SCENE_BYTES_MAX: u64 = 4 << 20;
+
+const MAGIC: &[u8; 8] = b"DMTDIR01";
+const ENTRY_BYTES: usize = 32;
+const SCENE_FILE: &str = "scene.json";
+const WORK_FOLDER: &str = ".building";
+
+/// The name of a blob.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Key {
+    /// Position of the layer in the scene.
+    pub layer: u8,
+    /// What the blob is.
+    pub kind: Kind,
+    /// The page, or the diamond's x.
+    pub a: u32,
+    /// 0, or the diamond's y.
+    pub b: u32,
+}
+
+/// What a blob is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Kind {
+    /// A page of the index, zstd-compressed.
+    Index,
+    /// The points of a diamond.
+    Points,
+}
+
+/// Why a store could not be written or read.
+#[derive(Debug, thiserror::Error)]
+pub enum StoreError {
+    /// The file system said no.
+    #[error("{path}: cannot {action}: {error}{}", remedy(error))]
+    Io {
+        /// What was being done.
+        action: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        error: io::Error,
+    },
+    /// There is no store here.
+    #[error("{0}: not a store: expected a folder with a {SCENE_FILE} in it; build one with `diamantina-server build DEM -o {0}`")]
+    NotAStore(PathBuf),
+    /// Another build holds the lock.
+    #[error("{0}: another build is writing this store: wait for it, or choose another folder with -o")]
+    Busy(PathBuf),
+    /// Written by another version.
+    #[error("{path}: store has format {found}, this program reads {FORMAT}: build it again")]
+    Format {
+        /// The store.
+        path: PathBuf,
+        /// The format found.
+        found: u32,
+    },
+    /// The content does not match its hashes.
+    #[error("{path}: damaged: {what}; build the store again, or copy it again from where it is intact")]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What was expected and what was found.
+        what: String,
+    },
+}
+
+fn remedy(error: &io::Error) -> &'static str {
+    match error.kind() {
+        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => "; free some space and build again (the old scene, if any, is untouched)",
+        io::ErrorKind::PermissionDenied => "; choose a folder that you may write to",
+        io::ErrorKind::ReadOnlyFilesystem => "; choose a folder on a disk that can be written",
+        _ => "",
+    }
+}
+
+fn io_at<'a>(action: &'static str, path: &'a Path) -> impl Fn(io::Error) -> StoreError + 'a {
+    move |error| StoreError::Io { action, path: path.to_owned(), error }
+}
+
+/// `scene.json`: the scene and what is needed to check and read the rest.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+struct Manifest {
+    format: u32,
+    directory_hash: String,
+    pack_bytes: Vec<u64>,
+    scene: Scene,
+}
+
+impl Manifest {
+    /// The version that the content has: a hash of everything but the version itself.
+    fn version(&self) -> String {
+        let mut nameless = self.clone();
+        nameless.scene.version = String::new();
+        // Our own types always serialise.
+        let json = serde_json::to_vec(&nameless).unwrap_or_default();
+        blake3::hash(&json).to_hex()[..16].to_owned()
+    }
+}
+
+/// Where a blob lies.
+#[derive(Debug, Clone, Copy)]
+struct Place {
+    pack: u32,
+    offset: u32,
+    bytes: u32,
+    checksum: u64,
+}
+
+fn kind_code(kind: Kind) -> u8 {
+    match kind {
+        Kind::Index => 1,
+        Kind::Points => 2,
+    }
+}
+
+fn directory_bytes(entries: &[(Key, Place)]) -> Vec<u8> {
+    let mut out = Vec::with_capacity(12 + entries.len() * ENTRY_BYTES);
+    out.extend(MAGIC);
+    out.extend(u32::try_from(entries.len()).unwrap_or(u32::MAX).to_le_bytes());
+    for (key, place) in entries {
+        out.extend([key.layer, kind_code(key.kind), 0, 0]);
+        for number in [key.a, key.b, place.pack, place.offset, place.bytes] {
+            out.extend(number.to_le_bytes());
+        }
+        out.extend(place.checksum.to_le_bytes());
+    }
+    out
+}
+
+fn read_directory(bytes: &[u8], pack_bytes: &[u64]) -> Result<Vec<(Key, Place)>, String> {
+    let (head, rest) = bytes.split_first_chunk::<12>().ok_or("directory is cut off")?;
+    if head[..8] != *MAGIC {
+        return Err(format!("directory starts with {:02x?}, expected {MAGIC:02x?}", &head[..8]));
+    }
+    let (entries, tail) = rest.as_chunks::<ENTRY_BYTES>();
+    let count = u32::from_le_bytes([head[8], head[9], head[10], head[11]]);
+    if !tail.is_empty() || entries.len() != count as usize {
+        return Err(format!("directory claims {count} blobs and lists {}", entries.len()));
+    }
+    let mut list = Vec::with_capacity(entries.len());
+    for e in entries {
+        let number = |i: usize| u32::from_le_bytes([e[i], e[i + 1], e[i + 2], e[i + 3]]);
+        let kind = match e[1] {
+            1 => Kind::Index,
+            2 => Kind::Points,
+            other => return Err(format!("directory has a blob of kind {other}")),
+        };
+        let key = Key { layer: e[0], kind, a: number(4), b: number(8) };
+        let checksum = u64::from(number(24)) | u64::from(number(28)) << 32;
+        let place = Place { pack: number(12), offset: number(16), bytes: number(20), checksum };
+        let room = pack_bytes.get(place.pack as usize).copied().unwrap_or(0);
+        if place.bytes > BLOB_BYTES_MAX || u64::from(place.offset) + u64::from(place.bytes) > room {
+            return Err(format!("{key:?} lies outside of its pack"));
+        }
+        list.push((key, place));
+    }
+    Ok(list)
+}
+
+/// A store being written. Dropped unpublished, it leaves nothing behind but the empty folder.
+#[derive(Debug)]
+pub struct Writer {
+    root: PathBuf,
+    work: PathBuf,
+    /// Keeps the lock while the writer lives.
+    _lock: File,
+    spool: Mutex<Spool>,
+}
+
+#[derive(Debug)]
+struct Spool {
+    file: BufWriter<File>,
+    bytes: u64,
+    blobs: Vec<Spooled>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Spooled {
+    order: u64,
+    key: Key,
+    offset: u64,
+    bytes: u32,
+    checksum: u64,
+}
+
+impl Writer {
+    /// Starts a store at `root`, which may hold an older one: that stays as it is until
+    /// [`Writer::publish`].
+    ///
+    /// # Errors
+    /// When another build is at work there or the folder cannot be written.
+    pub fn create(root: &Path) -> Result<Self, StoreError> {
+        fs::create_dir_all(root).map_err(io_at("create the folder", root))?;
+        let lock_path = root.join(".lock");
+        let lock = File::options().create(true).append(true).open(&lock_path).map_err(io_at("create", &lock_path))?;
+        match lock.try_lock() {
+            Ok(()) => {}
+            Err(fs::TryLockError::WouldBlock) => return Err(StoreError::Busy(root.to_owned())),
+            Err(fs::TryLockError::Error(error)) => return Err(io_at("lock", &lock_path)(error)),
+        }
+        let work = root.join(WORK_FOLDER);
+        // Whoever left this behind is gone, since the lock was free.
+        match fs::remove_dir_all(&work) {
+            Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(io_at("remove the leftovers in", &work)(e)),
+            _ => {}
+        }
+        fs::create_dir(&work).map_err(io_at("create the folder", &work))?;
+        let spool_path = work.join("spool");
+        let spool = File::options().create_new(true).read(true).write(true).open(&spool_path);
+        let file = BufWriter::with_capacity(1 << 20, spool.map_err(io_at("create", &spool_path))?);
+        let spool = Mutex::new(Spool { file, bytes: 0, blobs: Vec::new() });
+        Ok(Self { root: root.to_owned(), work, _lock: lock, spool })
+    }
+
+    /// A folder for the builder's own temporary files; it goes with the work folder.
+    #[must_use]
+    pub fn work_folder(&self) -> &Path {
+        &self.work
+    }
+
+    /// Adds a blob. Blobs are laid down by `order`, then key, whatever the order of the calls.
+    ///
+    /// # Errors
+    /// When the disk is full or fails.
+    pub fn put(&self, key: Key, order: u64, blob: &[u8]) -> Result<(), StoreError> {
+        let checksum = xxh3_64(blob);
+        let mut spool = self.spool.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let path = self.work.join("spool");
+        spool.file.write_all(blob).map_err(io_at("write", &path))?;
+        let offset = spool.bytes;
+        spool.bytes += blob.len() as u64;
+        let bytes = u32::try_from(blob.len()).unwrap_or(u32::MAX);
+        spool.blobs.push(Spooled { order, key, offset, bytes, checksum });
+        Ok(())
+    }
+
+    /// Lays the blobs into packs and makes the scene the store's own, atomically. `scene.version` is
+    /// filled in; the result is the scene as published. An older version's folder is removed.
+    ///
+    /// # Errors
+    /// When the disk is full or fails: the old scene, if any, is then untouched.
+    pub fn publish(self, mut scene: Scene) -> Result<Scene, StoreError> {
+        let mut spool = self.spool.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let spool_path = self.work.join("spool");
+        spool.file.flush().map_err(io_at("write", &spool_path))?;
+        let mut blobs = std::mem::take(&mut spool.blobs);
+        blobs.sort_unstable_by_key(|b| (b.order, b.key));
+        let data = self.work.join("data");
+        fs::create_dir(&data).map_err(io_at("create the folder", &data))?;
+        let (mut entries, pack_bytes) = lay_packs(spool.file.get_ref(), &spool_path, &blobs, &data)?;
+        entries.sort_unstable_by_key(|(key, _)| *key);
+        let directory = directory_bytes(&entries);
+        write_synced(&data.join("directory"), &directory)?;
+        let directory_hash = blake3::hash(&directory).to_hex().to_string();
+        scene.version = String::new();
+        let mut manifest = Manifest { format: FORMAT, directory_hash, pack_bytes, scene };
+        manifest.scene.version = manifest.version();
+        sync_folder(&data)?;
+
+        let place = self.root.join(&manifest.scene.version);
+        // The same content may be there already: then it is replaced by itself.
+        if place.exists() {
+            fs::remove_dir_all(&place).map_err(io_at("replace", &place))?;
+        }
+        fs::rename(&data, &place).map_err(io_at("move into place", &place))?;
+        sync_folder(&self.root)?;
+        let older = Manifest::read(&self.root).ok().map(|m| m.scene.version);
+        let json = serde_json::to_vec_pretty(&manifest).unwrap_or_default();
+        let fresh = self.work.join(SCENE_FILE);
+        write_synced(&fresh, &json)?;
+        let current = self.root.join(SCENE_FILE);
+        fs::rename(&fresh, &current).map_err(io_at("publish", &current))?;
+        sync_folder(&self.root)?;
+        if let Some(older) = older.filter(|v| *v != manifest.scene.version && diamantina_protocol::message::is_name(v)) {
+            // A server that has it open keeps its files; who cannot remove it only keeps some bytes more.
+            let _ = fs::remove_dir_all(self.root.join(older));
+        }
+        Ok(manifest.scene)
+    }
+}
+
+impl Drop for Writer {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.work);
+    }
+}
+
+/// Copies the blobs, in order, into packs.
+fn lay_packs(spool: &File, spool_path: &Path, blobs: &[Spooled], data: &Path) -> Result<(Vec<(Key, Place)>, Vec<u64>), StoreError> {
+    let mut entries = Vec::with_capacity(blobs.len());
+    let mut pack_bytes = Vec::new();
+    let mut buffer = Vec::new();
+    let mut rest = blobs;
+    while !rest.is_empty() {
+        let path = data.join(pack_name(pack_bytes.len()));
+        let file = File::create_new(&path).map_err(io_at("create", &path))?;
+        let mut out = BufWriter::with_capacity(1 << 20, file);
+        let mut written = 0u64;
+        while let Some((blob, more)) = rest.split_first() {
+            if written > 0 && written + u64::from(blob.bytes) > PACK_BYTES {
+                break;
+            }
+            buffer.resize(blob.bytes as usize, 0);
+            spool.read_exact_at(&mut buffer, blob.offset).map_err(io_at("read", spool_path))?;
+            out.write_all(&buffer).map_err(io_at("write", &path))?;
+            let place = Place {
+                pack: u32::try_from(pack_bytes.len()).unwrap_or(u32::MAX),
+                offset: u32::try_from(written).unwrap_or(u32::MAX),
+                bytes: blob.bytes,
+                checksum: blob.checksum,
+            };
+            entries.push((blob.key, place));
+            written += u64::from(blob.bytes);
+            rest = more;
+        }
+        let file = out.into_inner().map_err(|e| io_at("write", &path)(e.into_error()))?;
+        file.sync_all().map_err(io_at("sync", &path))?;
+        pack_bytes.push(written);
+    }
+    Ok((entries, pack_bytes))
+}
+
+fn pack_name(number: usize) -> String {
+    format!("pack-{number:05}")
+}
+
+fn write_synced(path: &Path, bytes: &[u8]) -> Result<(), StoreError> {
+    let mut file = File::create(path).map_err(io_at("create", path))?;
+    file.write_all(bytes).map_err(io_at("write", path))?;
+    file.sync_all().map_err(io_at("sync", path))
+}
+
+fn sync_folder(path: &Path) -> Result<(), StoreError> {
+    File::open(path).and_then(|f| f.sync_all()).map_err(io_at("sync the folder", path))
+}
+
+impl Manifest {
+    fn read(root: &Path) -> Result<Self, StoreError> {
+        let path = root.join(SCENE_FILE);
+        let mut file = match File::open(&path) {
+            Ok(file) => file,
+            Err(e) if matches!(e.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => {
+                return Err(StoreError::NotAStore(root.to_owned()));
+            }
+            Err(e) => return Err(io_at("open", &path)(e)),
+        };
+        let mut text = Vec::new();
+        file.by_ref().take(SCENE_BYTES_MAX).read_to_end(&mut text).map_err(io_at("read", &path))?;
+        let damaged = |what: String| StoreError::Damaged { path: path.clone(), what };
+        let value: serde_json::Value = serde_json::from_slice(&text).map_err(|e| damaged(format!("not JSON ({e})")))?;
+        match value.get("format").and_then(serde_json::Value::as_u64) {
+            Some(format) if format == u64::from(FORMAT) => {}
+            Some(format) => {
+                let found = u32::try_from(format).unwrap_or(u32::MAX);
+                return Err(StoreError::Format { path: root.to_owned(), found });
+            }
+            None => return Err(damaged("no format number".to_owned())),
+        }
+        let manifest: Self = serde_json::from_value(value).map_err(|e| damaged(e.to_string()))?;
+        if manifest.version() != manifest.scene.version {
+            return Err(damaged(format!("says version {}, its content has {}", manifest.scene.version, manifest.version())));
+        }
+        Ok(manifest)
+    }
+}
+
+/// A store opened for reading. Cheap to share; reads do not block one another.
+#[derive(Debug)]
+pub struct Store {
+    root: PathBuf,
+    scene: Scene,
+    packs: Vec<(PathBuf, File)>,
+    places: HashMap<Key, Place>,
+}
+
+impl Store {
+    /// Opens the scene that is current at `root`, checking the description and the directory against
+    /// their hashes. Takes about 60 bytes of memory a blob.
+    ///
+    /// # Errors
+    /// When there is no store, it is of another format, or damaged.
+    pub fn open(root: &Path) -> Result<Self, StoreError> {
+        let manifest = Manifest::read(root)?;
+        let data = root.join(&manifest.scene.version);
+        let path = data.join("directory");
+        let damaged = |what: String| StoreError::Damaged { path: path.clone(), what };
+        let bytes = fs::read(&path).map_err(io_at("read", &path))?;
+        if blake3::hash(&bytes).to_hex().as_str() != manifest.directory_hash {
+            return Err(damaged("it does not match the hash in scene.json".to_owned()));
+        }
+        let places = read_directory(&bytes, &manifest.pack_bytes).map_err(damaged)?.into_iter().collect();
+        let mut packs = Vec::new();
+        for (i, expected) in manifest.pack_bytes.iter().enumerate() {
+            let path = data.join(pack_name(i));
+            let mut file = File::open(&path).map_err(io_at("open", &path))?;
+            let found = file.seek(SeekFrom::End(0)).map_err(io_at("read", &path))?;
+            if found != *expected {
+                let what = format!("has {found} bytes, expected {expected}");
+                return Err(StoreError::Damaged { path, what });
+            }
+            packs.push((path, file));
+        }
+        Ok(Self { root: root.to_owned(), scene: manifest.scene, packs, places })
+    }
+
+    /// The folder.
+    #[must_use]
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// What the scene is.
+    #[must_use]
+    pub fn scene(&self) -> &Scene {
+        &self.scene
+    }
+
+    /// The blob of a key, checked; `None` if there is none.
+    ///
+    /// # Errors
+    /// When the disk fails or the blob does not match its checksum.
+    pub fn get(&self, key: Key) -> Result<Option<Bytes>, StoreError> {
+        let Some(place) = self.places.get(&key) else { return Ok(None) };
+        let (path, file) = &self.packs[place.pack as usize];
+        let mut blob = vec![0; place.bytes as usize];
+        file.read_exact_at(&mut blob, place.offset.into()).map_err(io_at("read", path))?;
+        let found = xxh3_64(&blob);
+        if found != place.checksum {
+            let what = format!("blob {key:?} at byte {} has checksum {found:016x}, expected {:016x}", place.offset, place.checksum);
+            return Err(StoreError::Damaged { path: path.clone(), what });
+        }
+        Ok(Some(blob.into()))
+    }
+
+    /// Every key with its size in bytes, in no order.
+    pub fn keys(&self) -> impl Iterator<Item = (Key, u32)> {
+        self.places.iter().map(|(key, place)| (*key, place.bytes))
+    }
+}
