@@ -1,1 +1,4 @@
 //! Builds and serves streamed terrain.
+
+pub mod ingest;
+pub mod projection;
