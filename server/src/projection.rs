@@ -178,11 +178,8 @@ fn convert(from: &Proj, to: &Proj, x: f64, y: f64) -> Option<(f64, f64)> {
     let (x, y) = if from.is_latlong() { (x.to_radians(), y.to_radians()) } else { (x, y) };
     let mut point = (x, y, 0.0);
     transform(from, to, &mut point).ok()?;
-    let (x, y) = if to.is_latlong() {
-        (point.0.to_degrees(), point.1.to_degrees())
-    } else {
-        (point.0, point.1)
-    };
+    let (x, y) =
+        if to.is_latlong() { (point.0.to_degrees(), point.1.to_degrees()) } else { (point.0, point.1) };
     (x.is_finite() && y.is_finite()).then_some((x, y))
 }
 
@@ -268,7 +265,10 @@ mod tests {
                 let Some((x, y)) = projection.forward(lon, lat) else { continue };
                 let Some((lon2, lat2)) = projection.inverse(x, y) else { continue };
                 if (lon2 - lon).abs() < 90.0 && (x.abs() < 1e7) {
-                    assert!((lon - lon2).abs() < 2e-5 && (lat - lat2).abs() < 2e-5, "{projection:?} {lon} {lat}");
+                    assert!(
+                        (lon - lon2).abs() < 2e-5 && (lat - lat2).abs() < 2e-5,
+                        "{projection:?} {lon} {lat}"
+                    );
                 }
             }
         }

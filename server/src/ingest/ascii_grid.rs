@@ -30,10 +30,17 @@ pub(super) fn open(path: &Path, file: File) -> Result<Raster> {
 /// The only grid of a zip archive.
 pub(super) fn open_zip(path: &Path, file: File) -> Result<Raster> {
     let failed = |e: zip::result::ZipError| {
-        broken(path, "a readable zip archive", e.to_string(), "fetch it again, or unzip it and give the grid itself")
+        broken(
+            path,
+            "a readable zip archive",
+            e.to_string(),
+            "fetch it again, or unzip it and give the grid itself",
+        )
     };
     let mut archive = zip::ZipArchive::new(BufReader::new(file)).map_err(failed)?;
-    let grids: Vec<_> = archive.file_names().filter(|n| n.to_lowercase().ends_with(".asc")).map(str::to_owned).collect();
+    // Names that are not text cannot end in ".asc" either.
+    let names = archive.file_names().filter_map(|name| Some(name.ok()?.into_owned()));
+    let grids: Vec<String> = names.filter(|name| name.to_lowercase().ends_with(".asc")).collect();
     let [name] = &grids[..] else {
         return Err(unsupported(
             path,
@@ -113,14 +120,22 @@ fn header(path: &Path, words: &mut Words<'_, impl BufRead>) -> Result<(Header, O
             return Ok((header, Some(value)));
         }
         let value = match words.next()? {
-            Some(word) => parse(&word).ok_or_else(|| broken(path, format!("a number after '{keyword}'"), format!("'{word}'"), REMEDY))?,
+            Some(word) => parse(&word).ok_or_else(|| {
+                broken(path, format!("a number after '{keyword}'"), format!("'{word}'"), REMEDY)
+            })?,
             None => return Err(broken(path, format!("a number after '{keyword}'"), "the end", REMEDY)),
         };
         let finite = || Some(value).filter(|v| v.is_finite());
         let positive = || finite().filter(|v| *v > 0.0);
         let known = match keyword.as_str() {
-            "ncols" => { header.columns = side(value); header.columns.is_some() }
-            "nrows" => { header.rows = side(value); header.rows.is_some() }
+            "ncols" => {
+                header.columns = side(value);
+                header.columns.is_some()
+            }
+            "nrows" => {
+                header.rows = side(value);
+                header.rows.is_some()
+            }
             "xllcorner" | "xllcenter" => {
                 header.centred[0] = keyword.ends_with("center");
                 header.x = finite();
@@ -131,10 +146,22 @@ fn header(path: &Path, words: &mut Words<'_, impl BufRead>) -> Result<(Header, O
                 header.y = finite();
                 header.y.is_some()
             }
-            "cellsize" => { (header.dx, header.dy) = (positive(), positive()); header.dx.is_some() }
-            "dx" => { header.dx = positive(); header.dx.is_some() }
-            "dy" => { header.dy = positive(); header.dy.is_some() }
-            "nodata_value" | "nodata" => { header.nodata = Some(value); true }
+            "cellsize" => {
+                (header.dx, header.dy) = (positive(), positive());
+                header.dx.is_some()
+            }
+            "dx" => {
+                header.dx = positive();
+                header.dx.is_some()
+            }
+            "dy" => {
+                header.dy = positive();
+                header.dy.is_some()
+            }
+            "nodata_value" | "nodata" => {
+                header.nodata = Some(value);
+                true
+            }
             _ => false,
         };
         if !known {
@@ -188,7 +215,12 @@ impl<R: BufRead> Words<'_, R> {
             self.input.consume(used);
             if self.word.len() > WORD_BYTES_MAX {
                 let found = format!("'{}...'", String::from_utf8_lossy(&self.word[..16]));
-                return Err(broken(self.path, format!("words of at most {WORD_BYTES_MAX} letters"), found, REMEDY));
+                return Err(broken(
+                    self.path,
+                    format!("words of at most {WORD_BYTES_MAX} letters"),
+                    found,
+                    REMEDY,
+                ));
             }
             if end.is_some() && !self.word.is_empty() {
                 break;

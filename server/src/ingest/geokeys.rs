@@ -118,7 +118,9 @@ impl Keys {
         let mut crs = match self.code(3072) {
             Some(code) => SourceCrs::epsg(code, false),
             None => {
-                let proj4 = self.projection(unit.unwrap_or(1.0)).map(|text| format!("{text} {} +no_defs", self.datum()));
+                let proj4 = self
+                    .projection(unit.unwrap_or(1.0))
+                    .map(|text| format!("{text} {} +no_defs", self.datum()));
                 let name = self.citation(&[3073, 1026], proj4.as_deref().unwrap_or("unnamed projection"));
                 SourceCrs::new(name, proj4, false)
             }

@@ -328,11 +328,16 @@ impl Chunks {
                     left,
                     top,
                 };
-                self.read_part(path, &part, |row| {
-                    let start = (rows.end - 1 - row) as usize * window.width as usize
-                        + (part.columns.start - columns.start) as usize;
-                    start..start + part.columns.len()
-                }, out)?;
+                self.read_part(
+                    path,
+                    &part,
+                    |row| {
+                        let start = (rows.end - 1 - row) as usize * window.width as usize
+                            + (part.columns.start - columns.start) as usize;
+                        start..start + part.columns.len()
+                    },
+                    out,
+                )?;
             }
         }
         Ok(())
@@ -366,7 +371,9 @@ impl Chunks {
             let mut bytes = vec![0; part.columns.len() * size];
             for row in part.rows.clone() {
                 let at = ((row - part.top) as usize * stride + skip) * size;
-                self.file.read_exact_at(&mut bytes, offset + at as u64).map_err(io_error(path, "read samples"))?;
+                self.file
+                    .read_exact_at(&mut bytes, offset + at as u64)
+                    .map_err(io_error(path, "read samples"))?;
                 decode(&bytes, self.dtype, self.big_endian, out[target(row)].iter_mut());
             }
         }

@@ -263,7 +263,9 @@ fn check_numbers(file: &Path, options: &Options) -> Result<()> {
     };
     match options {
         Options { cell: Some(v), .. } if !(v.is_finite() && *v > 0.0) => bad("--cell above 0", *v),
-        Options { height_scale: Some(v), .. } if !v.is_finite() || *v == 0.0 => bad("--height-scale not 0", *v),
+        Options { height_scale: Some(v), .. } if !v.is_finite() || *v == 0.0 => {
+            bad("--height-scale not 0", *v)
+        }
         Options { height_offset: Some(v), .. } if !v.is_finite() => bad("--height-offset", *v),
         _ => Ok(()),
     }
@@ -300,7 +302,9 @@ fn detect(path: &Path, file: File, name: &str, cache: &Arc<ChunkCache>, id: u32)
     match &start[..] {
         [] => Err(broken(path, "a DEM", "an empty file", "fetch it again")),
         _ if name.ends_with(".hgt") => hgt::open(path, file),
-        [b'I', b'I', 42 | 43, 0, ..] | [b'M', b'M', 0, 42 | 43, ..] => geotiff::open(path, file, Arc::clone(cache), id),
+        [b'I', b'I', 42 | 43, 0, ..] | [b'M', b'M', 0, 42 | 43, ..] => {
+            geotiff::open(path, file, Arc::clone(cache), id)
+        }
         [0x89, b'P', b'N', b'G', ..] => png::open(path, file),
         [b'P', b'K', 3 | 5, ..] => ascii_grid::open_zip(path, file),
         _ if text.starts_with(b"ncols") || text.starts_with(b"nrows") => ascii_grid::open(path, file),
@@ -430,11 +434,21 @@ fn known_crs(file: &Path, code: u32) -> Result<SourceCrs> {
     let crs = SourceCrs::epsg(code, false);
     if crs.proj4.is_none() {
         let expected = "--crs with a known EPSG code";
-        return Err(bad_options(file, expected, crs.name, "choose another code, such as EPSG:32632 for UTM 32 north"));
+        return Err(bad_options(
+            file,
+            expected,
+            crs.name,
+            "choose another code, such as EPSG:32632 for UTM 32 north",
+        ));
     }
     if crs.geographic {
         let found = format!("{}, whose unit is the degree", crs.name);
-        return Err(bad_options(file, "--crs with a projected CRS", found, "use --crs source to keep degrees"));
+        return Err(bad_options(
+            file,
+            "--crs with a projected CRS",
+            found,
+            "use --crs source to keep degrees",
+        ));
     }
     Ok(crs)
 }
@@ -442,7 +456,8 @@ fn known_crs(file: &Path, code: u32) -> Result<SourceCrs> {
 /// Where degrees go unless told otherwise: the UTM zone of the centre, polar stereographic beyond UTM, and
 /// on other bodies a transverse Mercator about the centre.
 fn natural_crs(file: &Path, mosaic: &Mosaic, place: &Place, crs: &SourceCrs) -> Result<SourceCrs> {
-    let middle = |axis: usize, samples: u32| place.origin[axis] + place.step[axis] * f64::from(samples - 1) / 2.0;
+    let middle =
+        |axis: usize, samples: u32| place.origin[axis] + place.step[axis] * f64::from(samples - 1) / 2.0;
     let lon = (middle(0, mosaic.width) + 180.0).rem_euclid(360.0) - 180.0;
     let lat = middle(1, mosaic.height);
     let degrees = place.step[0] * f64::from(mosaic.width);

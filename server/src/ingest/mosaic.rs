@@ -133,9 +133,13 @@ fn offset(first: &Raster, second: &Raster) -> Result<[i64; 2]> {
     let mut offset = [0; 2];
     for i in 0..2 {
         let cells = (b.origin[i] - a.origin[i]) / a.step[i];
-        let whole = super::whole(cells.abs().round()).filter(|w| (f64::from(*w) - cells.abs()).abs() <= OFFSET_TOLERANCE);
+        let whole = super::whole(cells.abs().round())
+            .filter(|w| (f64::from(*w) - cells.abs()).abs() <= OFFSET_TOLERANCE);
         let Some(whole) = whole else {
-            return Err(differ("whole cells between them".into(), format!("{cells} cells along {}", ["x", "y"][i])));
+            return Err(differ(
+                "whole cells between them".into(),
+                format!("{cells} cells along {}", ["x", "y"][i]),
+            ));
         };
         offset[i] = if cells < 0.0 { -i64::from(whole) } else { i64::from(whole) };
     }

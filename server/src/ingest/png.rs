@@ -25,7 +25,12 @@ pub(super) fn open(path: &Path, file: File) -> Result<Raster> {
     let (width, height) = (info.width, info.height);
     if width > SIDE_MAX || height > SIDE_MAX {
         let found = format!("{width} x {height}");
-        return Err(broken(path, format!("at most {SIDE_MAX} samples a side"), found, "fetch the file again"));
+        return Err(broken(
+            path,
+            format!("at most {SIDE_MAX} samples a side"),
+            found,
+            "fetch the file again",
+        ));
     }
     let dtype = match (info.color_type, info.bit_depth, info.interlaced) {
         (ColorType::Grayscale, BitDepth::Eight, false) => Dtype::U8,

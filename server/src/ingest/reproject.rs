@@ -44,7 +44,12 @@ impl Reprojection {
     /// Plans the target grid: it covers the source, its samples are whole multiples of the cell.
     /// `cell_metres` defaults to the geometric mean of the source cell's two sizes at its centre, measured
     /// in the target CRS.
-    pub(super) fn new(mosaic: &Mosaic, place: &Place, target: &SourceCrs, cell_metres: Option<f64>) -> Result<Self> {
+    pub(super) fn new(
+        mosaic: &Mosaic,
+        place: &Place,
+        target: &SourceCrs,
+        cell_metres: Option<f64>,
+    ) -> Result<Self> {
         let file = &mosaic.first().file;
         let projection = |crs: &SourceCrs| -> Result<Projection> {
             let built = crs.proj4.as_deref().map(Projection::new);
@@ -152,7 +157,10 @@ impl Reprojection {
             let centre = self.place.origin[0] + f64::from(self.source_size[0]) / 2.0 * self.place.step[0];
             x -= ((x - centre) / turn).round() * turn;
         }
-        Some([(x - self.place.origin[0]) / self.place.step[0], (y - self.place.origin[1]) / self.place.step[1]])
+        Some([
+            (x - self.place.origin[0]) / self.place.step[0],
+            (y - self.place.origin[1]) / self.place.step[1],
+        ])
     }
 
     /// Fills `out` with the window's values, rows from the south. About 2 MiB beside the source's own, up to
@@ -174,7 +182,15 @@ impl Reprojection {
                 self.positions(bx, by, part, &mut positions);
                 let start = (part.y0 - window.y0) as usize * width + (part.x0 - window.x0) as usize;
                 let all = Window { x0: 0, y0: 0, ..part };
-                self.sample(mosaic, &positions, part.width as usize, all, width, &mut out[start..], &mut region)?;
+                self.sample(
+                    mosaic,
+                    &positions,
+                    part.width as usize,
+                    all,
+                    width,
+                    &mut out[start..],
+                    &mut region,
+                )?;
             }
         }
         Ok(())
@@ -186,15 +202,18 @@ impl Reprojection {
         let (rows, columns) = (part.y0..part.y0 + part.height, part.x0..part.x0 + part.width);
         let Some(nodes) = self.nodes(bx, by) else {
             for y in rows {
-                positions.extend(columns.clone().map(|x| {
-                    self.inverse(f64::from(x), f64::from(y)).unwrap_or([f64::NAN; 2])
-                }));
+                positions.extend(
+                    columns
+                        .clone()
+                        .map(|x| self.inverse(f64::from(x), f64::from(y)).unwrap_or([f64::NAN; 2])),
+                );
             }
             return;
         };
         for y in rows {
             let v = f64::from(y - by) / f64::from(BLOCK / 2) - 1.0;
-            let line: [[f64; 2]; 3] = std::array::from_fn(|i| parabola([nodes[0][i], nodes[1][i], nodes[2][i]], v));
+            let line: [[f64; 2]; 3] =
+                std::array::from_fn(|i| parabola([nodes[0][i], nodes[1][i], nodes[2][i]], v));
             // Coefficients along x once a row, then two multiplications a coordinate.
             let coefficient = |a: usize| {
                 let [p, q, r] = line.map(|n| n[a]);
@@ -225,7 +244,10 @@ impl Reprojection {
                 let (u, v) = (f64::from(i) / 2.0 - 1.0, f64::from(j) / 2.0 - 1.0);
                 let exact = self.inverse(bx + (u + 1.0) * half, by + (v + 1.0) * half)?;
                 let near = parabola(nodes.map(|row| parabola(row, u)), v);
-                if (0..2).any(|a| (exact[a] - near[a]).abs().partial_cmp(&MIDPOINT_ERROR_MAX) != Some(std::cmp::Ordering::Less)) {
+                if (0..2).any(|a| {
+                    (exact[a] - near[a]).abs().partial_cmp(&MIDPOINT_ERROR_MAX)
+                        != Some(std::cmp::Ordering::Less)
+                }) {
                     return None;
                 }
             }

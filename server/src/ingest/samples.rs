@@ -53,7 +53,8 @@ impl SampleFile {
             Order::RowsFromNorth => {
                 let mut bytes = vec![0; w * size];
                 for (y, row) in (window.y0..).zip(out.chunks_exact_mut(w.max(1))) {
-                    let before = u64::from(self.height - 1 - y) * u64::from(self.width) + u64::from(window.x0);
+                    let before =
+                        u64::from(self.height - 1 - y) * u64::from(self.width) + u64::from(window.x0);
                     self.read_at(path, before, &mut bytes)?;
                     decode(&bytes, self.dtype, self.big_endian, row.iter_mut());
                 }
@@ -77,7 +78,12 @@ impl SampleFile {
 }
 
 /// Turns bytes into values, one for each place of `out`.
-pub(super) fn decode<'a>(bytes: &[u8], dtype: Dtype, big_endian: bool, out: impl Iterator<Item = &'a mut f64>) {
+pub(super) fn decode<'a>(
+    bytes: &[u8],
+    dtype: Dtype,
+    big_endian: bool,
+    out: impl Iterator<Item = &'a mut f64>,
+) {
     macro_rules! each {
         ($type:ty) => {{
             let (chunks, _) = bytes.as_chunks::<{ size_of::<$type>() }>();
@@ -122,10 +128,8 @@ impl Transcript {
     }
 
     pub(super) fn finish(self, path: &Path, order: Order, width: u32, height: u32) -> Result<SampleFile> {
-        let file = self
-            .writer
-            .into_inner()
-            .map_err(|e| io_error(path, "write a temporary file")(e.into_error()))?;
+        let file =
+            self.writer.into_inner().map_err(|e| io_error(path, "write a temporary file")(e.into_error()))?;
         let samples = SampleFile { file, dtype: Dtype::F64, big_endian: false, order, width, height };
         samples.check_length(path)?;
         Ok(samples)

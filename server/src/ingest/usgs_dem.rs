@@ -33,7 +33,8 @@ const REMEDY: &str = "fetch the file again, or convert it to GeoTIFF";
 
 /// True if the first bytes of a file look like a record A.
 pub(super) fn looks_like(start: &[u8]) -> bool {
-    let field = |from, to| start.get(from..to).and_then(|b| std::str::from_utf8(b).ok()?.trim().parse::<u32>().ok());
+    let field =
+        |from, to| start.get(from..to).and_then(|b| std::str::from_utf8(b).ok()?.trim().parse::<u32>().ok());
     start.len() >= 1024
         && field(144, 150).is_some_and(|level| (1..=4).contains(&level))
         && field(150, 156) == Some(1)
@@ -68,7 +69,8 @@ pub(super) fn open(path: &Path, file: &File) -> Result<Raster> {
     let mut skips = Vec::with_capacity(columns.len());
     for column in &columns {
         let skip = (column.south - south) / header.step[1];
-        let whole = super::whole(skip.round()).filter(|k| *k < SIDE_MAX && (skip - f64::from(*k)).abs() < 0.01);
+        let whole =
+            super::whole(skip.round()).filter(|k| *k < SIDE_MAX && (skip - f64::from(*k)).abs() < 0.01);
         let skip = whole.ok_or_else(|| {
             broken(path, "columns on one lattice", format!("one that starts {skip} samples north"), REMEDY)
         })?;
@@ -118,7 +120,8 @@ fn header(path: &Path, record: &[u8]) -> Result<Header> {
     let zone = whole(record, 162, 168).unwrap_or(0);
     let datum = whole(record, 890, 892).unwrap_or(1);
     let zone_code = u32::try_from(zone.unsigned_abs()).unwrap_or(0);
-    let bad = |expected: &str, found: String| Err(unsupported(path, expected, found, "convert it to GeoTIFF"));
+    let bad =
+        |expected: &str, found: String| Err(unsupported(path, expected, found, "convert it to GeoTIFF"));
     let (code, geographic) = match (whole(record, 156, 162), whole(record, 528, 534), datum) {
         (Some(0), Some(3), 1) => (4267, true),
         (Some(0), Some(3), 2) => (4322, true),
@@ -171,7 +174,8 @@ fn columns(path: &Path, file: &File, header: &Header) -> Result<(Vec<Column>, f6
     for i in 0..header.columns {
         let mut bytes = [0; PROFILE_HEADER];
         file.read_exact_at(&mut bytes, at).map_err(|_| cut(i))?;
-        let count = whole(&bytes, 12, 18).and_then(|m| u32::try_from(m).ok()).filter(|m| (1..=SIDE_MAX).contains(m));
+        let count =
+            whole(&bytes, 12, 18).and_then(|m| u32::try_from(m).ok()).filter(|m| (1..=SIDE_MAX).contains(m));
         let (Some(count), Some(1), Some(x), Some(south)) =
             (count, whole(&bytes, 18, 24), real(&bytes, 24, 48), real(&bytes, 48, 72))
         else {
