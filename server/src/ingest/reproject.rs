@@ -338,11 +338,13 @@ fn bilinear(region: &[f64], area: Window, at: [f64; 2]) -> f64 {
     let (column, u) = split(at[0] - f64::from(area.x0));
     let (row, v) = split(at[1] - f64::from(area.y0));
     let width = area.width as usize;
+    // In this form flat water stays exactly flat.
+    let mix = |a: f64, b: f64, share: f64| a + (b - a) * share;
     let line = |row: usize| {
         let i = row * width + column;
-        if u > 0.0 { region[i] * (1.0 - u) + region[i + 1] * u } else { region[i] }
+        if u > 0.0 { mix(region[i], region[i + 1], u) } else { region[i] }
     };
-    if v > 0.0 { line(row) * (1.0 - v) + line(row + 1) * v } else { line(row) }
+    if v > 0.0 { mix(line(row), line(row + 1), v) } else { line(row) }
 }
 
 /// Whole part and weight of the next sample.

@@ -4,6 +4,7 @@
 //! |---|---|
 //! | 156..162, 162..168 | reference system (0 geographic, 1 UTM), UTM zone |
 //! | 528..534, 534..540 | unit on the ground (2 metres, 3 arc seconds), unit of height (1 feet, 2 metres) |
+//! | 546..738 | corners of the quadrangle: x, y of SW, NW, NE, SE |
 //! | 816..852 | resolution in x, y and z |
 //! | 858..864 | columns |
 //! | 890..892 | horizontal datum (1 NAD27, 2 WGS 72, 3 WGS 84, 4 NAD83), blank in the oldest: NAD27 |
@@ -50,6 +51,8 @@ struct Header {
     z_step: f64,
     height_metres: f64,
     columns: u32,
+    /// Lowest and highest y of the quadrangle's corners, NaN if blank.
+    corners: [f64; 2],
 }
 
 /// Where a column lies: the byte of its record, samples north of the southernmost row, and count.
@@ -64,7 +67,8 @@ pub(super) fn open(path: &Path, file: &File) -> Result<Raster> {
     file.read_exact_at(&mut record, 0).map_err(io_error(path, "read its header"))?;
     let header = header(path, &record)?;
     let (columns, west) = columns(path, file, &header)?;
-    let south = columns.iter().map(|c| c.south).fold(f64::INFINITY, f64::min);
+    let lowest = columns.iter().map(|c| c.south).fold(f64::INFINITY, f64::min);
+    let south = lowest - header.step[1] * rows_outside(lowest - header.corners[0], header.step[1]);
     let mut height = 0;
     let mut skips = Vec::with_capacity(columns.len());
     for column in &columns {
@@ -77,6 +81,9 @@ pub(super) fn open(path: &Path, file: &File) -> Result<Raster> {
         height = height.max(skip + column.count);
         skips.push(skip);
     }
+    let highest = south + f64::from(height.saturating_sub(1)) * header.step[1];
+    let above = rows_outside(header.corners[1] - highest, header.step[1]);
+    height = super::whole(f64::from(height) + above).unwrap_or(0);
     if !(1..=SIDE_MAX).contains(&height) {
         return Err(broken(path, format!("1 to {SIDE_MAX} rows"), height.to_string(), REMEDY));
     }
@@ -159,7 +166,22 @@ fn header(path: &Path, record: &[u8]) -> Result<Header> {
         z_step: dz,
         height_metres,
         columns,
+        corners: corners(record),
     })
+}
+
+/// Lowest and highest y among the four corners (bytes 546..738, x and y of each).
+fn corners(record: &[u8]) -> [f64; 2] {
+    let y = |i: usize| real(record, 570 + 48 * i, 594 + 48 * i);
+    let all = || (0..4).filter_map(y);
+    [all().fold(f64::NAN, f64::min), all().fold(f64::NAN, f64::max)]
+}
+
+/// Rows between the outermost sample and a corner beyond it, so that the rectangle covers the quadrangle
+/// as GDAL's does; they are nodata.
+fn rows_outside(distance: f64, step: f64) -> f64 {
+    // `max` turns the NaN of blank corners into 0.
+    (distance / step - 1e-6).ceil().max(0.0)
 }
 
 /// The first pass: the place of every column, and the x of the first.
