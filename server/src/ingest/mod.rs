@@ -549,5 +549,5 @@ fn grid(mosaic: &Mosaic, origin: [f64; 2], cell: [f64; 2], crs: Option<Crs>) -> 
 /// A whole number from 0 to `u32::MAX`, or `None`.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the range is checked")]
 fn whole(value: f64) -> Option<u32> {
-    (value.fract() == 0.0 && (0.0..=f64::from(u32::MAX)).contains(&value)).then(|| value as u32)
+    (value.fract() == 0.0 && (0.0..=f64::from(u32::MAX)).contains(&value)).then_some(value as u32)
 }

@@ -254,6 +254,69 @@ fn a_tiled_tiff_by_hand_reads_in_order() {
     assert_eq!(source.grid().cell, [2.0, 2.0]);
 }
 
+/// Entries of a one-strip TIFF of 32-bit floats, `length` bytes right behind the directory.
+fn float_strip(
+    width: u32,
+    height: u32,
+    compression: u32,
+    predictor: u32,
+    length: u32,
+) -> Vec<(u16, u16, u32, u32)> {
+    vec![
+        (256, 4, 1, width),
+        (257, 4, 1, height),
+        (258, 3, 1, 32),
+        (259, 3, 1, compression),
+        (262, 3, 1, 1),
+        (273, 4, 1, 8 + 2 + 12 * 10 + 4),
+        (277, 3, 1, 1),
+        (279, 4, 1, length),
+        (317, 3, 1, predictor),
+        (339, 3, 1, 3),
+    ]
+}
+
+#[test]
+fn zstd_and_the_float_predictor_unpack() {
+    let folder = folder();
+    let values = [[1.5f32, -2.25, 1e-3, 7e5], [0.0, 3.5, -8.125, 4e8]];
+    // Predictor 3: the bytes of a row sorted by significance, the highest first, then differences.
+    let row = |row: [f32; 4]| {
+        let mut bytes: Vec<u8> = (0..4).flat_map(|k| row.map(|v| v.to_be_bytes()[k])).collect();
+        (1..bytes.len()).rev().for_each(|i| bytes[i] = bytes[i].wrapping_sub(bytes[i - 1]));
+        bytes
+    };
+    let plain: Vec<u8> = values.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
+    for (predictor, bytes) in [(1, plain), (3, values.into_iter().flat_map(row).collect())] {
+        let packed = zstd::encode_all(&bytes[..], 3).unwrap();
+        let length = u32::try_from(packed.len()).unwrap();
+        let path = put(&folder, "a.tif", &raw_tiff(&float_strip(4, 2, 50000, predictor, length), &packed));
+        let source = open(&[path], &Options { cell: Some(1.0), ..Options::default() }).unwrap();
+        let expected: Vec<f64> = values.iter().rev().flatten().map(|v| f64::from(*v)).collect();
+        assert_eq!(whole_grid(&source), expected, "predictor {predictor}");
+    }
+}
+
+#[test]
+fn big_tiff_and_big_endian_read_the_same() {
+    let folder = folder();
+    let samples: Vec<u16> = (0..30).map(|i| i * 2000).collect();
+    let mut big = Cursor::new(Vec::new());
+    TiffEncoder::new_big(&mut big).unwrap().write_image::<colortype::Gray16>(6, 5, &samples).unwrap();
+    let short = |tag: u16, value: u16| [tag, 3, 0, 1, value, 0].map(u16::to_be_bytes).concat();
+    let mut motorola = b"MM\0*\0\0\0\x08\0\x07".to_vec();
+    for (tag, value) in [(256, 6), (257, 5), (258, 16), (262, 1), (273, 98), (277, 1), (279, 60)] {
+        motorola.extend(short(tag, value));
+    }
+    motorola.extend([0; 4]);
+    motorola.extend(samples.iter().flat_map(|v| v.to_be_bytes()));
+    let expected: Vec<f64> = samples.chunks(6).rev().flatten().map(|v| f64::from(*v)).collect();
+    for bytes in [big.into_inner(), motorola] {
+        let options = Options { cell: Some(1.0), ..Options::default() };
+        assert_eq!(whole_grid(&open(&[put(&folder, "a.tif", &bytes)], &options).unwrap()), expected);
+    }
+}
+
 #[test]
 fn nodata_becomes_nan_and_can_be_overridden() {
     let folder = folder();

@@ -58,7 +58,7 @@ impl<'a> Header<'a> {
             let (tag, kind) = (header.short(&e[..2]), header.short(&e[2..4]));
             let count = header.number(&e[4..4 + inline]);
             let value_place = place + 4 + inline as u64;
-            let total = count.checked_mul(size_of_kind(kind)).unwrap_or(u64::MAX);
+            let total = count.saturating_mul(size_of_kind(kind));
             let at = if total <= inline as u64 {
                 value_place
             } else {
