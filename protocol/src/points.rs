@@ -137,6 +137,12 @@ impl Coding {
         self.exponents.len() as u32 - 1
     }
 
+    /// The step of most points that a split at `level` adds, in quanta.
+    #[must_use]
+    pub fn level_step(&self, level: u32) -> u32 {
+        self.step(self.exponent(level, Place::Off)).cast_unsigned()
+    }
+
     fn step(&self, exponent: u8) -> i32 {
         (self.fine_step * 3u32.pow(exponent.into())).cast_signed()
     }

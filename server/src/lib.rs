@@ -1,9 +1,14 @@
 //! Builds and serves streamed terrain.
 
 pub mod canvas;
+pub mod demo;
+pub mod height;
 pub mod hierarchy;
+pub mod http;
 pub mod ingest;
+pub mod inspect;
 pub mod measure;
 pub mod progress;
 pub mod projection;
+pub mod sample;
 pub mod store;

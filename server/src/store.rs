@@ -393,7 +393,7 @@ impl Manifest {
             Err(e) => return Err(io_at("open", &path)(e)),
         };
         let mut text = Vec::new();
-        file.by_ref().take(SCENE_BYTES_MAX).read_to_end(&mut text).map_err(io_at("read", &path))?;
+        Read::by_ref(&mut file).take(SCENE_BYTES_MAX).read_to_end(&mut text).map_err(io_at("read", &path))?;
         let damaged = |what: String| StoreError::Damaged { path: path.clone(), what };
         let value: serde_json::Value = serde_json::from_slice(&text).map_err(|e| damaged(format!("not JSON ({e})")))?;
         match value.get("format").and_then(serde_json::Value::as_u64) {

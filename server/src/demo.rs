@@ -1,0 +1,134 @@
+//! The demonstration: a made landscape, built, served and drawn by the client.
+
+use crate::hierarchy::{self, BuildError, Options};
+use crate::http::{ServeError, Server};
+use crate::ingest::{self, IngestError};
+use crate::progress::Progress;
+use crate::sample;
+use diamantina_protocol::message::Kind;
+use diamantina_protocol::points::Rule;
+use std::io::{self, Write};
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// Why the demonstration stopped.
+#[derive(Debug, thiserror::Error)]
+pub enum DemoError {
+    /// A folder or file cannot be written.
+    #[error("{path}: {error}; choose a folder that you may write to with --folder")]
+    Io {
+        /// Which.
+        path: PathBuf,
+        /// What the system said.
+        error: io::Error,
+    },
+    /// The sample cannot be written.
+    #[error("{0}")]
+    Sample(String),
+    /// The sample cannot be read back.
+    #[error(transparent)]
+    Ingest(#[from] IngestError),
+    /// The sample cannot be built.
+    #[error(transparent)]
+    Build(#[from] BuildError),
+    /// The scene cannot be served.
+    #[error(transparent)]
+    Serve(#[from] ServeError),
+    /// There is no client to draw with.
+    #[error("{0}: not found; build the client beside the server: cargo build --release -p diamantina-client")]
+    NoClient(PathBuf),
+    /// The client failed.
+    #[error("the client could not draw the picture; its message is above")]
+    Client,
+}
+
+/// Makes the sample scene in `folder`, serves it at `listen` (any free port if that one is taken), draws a
+/// picture of it, says how to go on, and serves until interrupted, unless `headless`.
+///
+/// # Errors
+/// When any of that fails.
+pub fn run(folder: &Path, samples: u32, listen: SocketAddr, headless: bool) -> Result<(), DemoError> {
+    let at = |path: &Path| {
+        let path = path.to_owned();
+        move |error| DemoError::Io { path, error }
+    };
+    std::fs::create_dir_all(folder).map_err(at(folder))?;
+    let client = std::env::current_exe().map_err(at(folder))?.with_file_name("diamantina-client");
+    if !client.exists() {
+        return Err(DemoError::NoClient(client));
+    }
+    let (dem, store, picture) = (folder.join("sample.tif"), folder.join("sample"), folder.join("sample.png"));
+    say(&format!("Making a landscape of {samples} x {samples} samples: {}", dem.display()));
+    sample::write(&dem, samples).map_err(DemoError::Sample)?;
+    say(&format!("Building the store: {}", store.display()));
+    let source = ingest::open(std::slice::from_ref(&dem), &ingest::Options::default())?;
+    let options = Options {
+        scene: "sample".to_owned(),
+        layer: "terrain".to_owned(),
+        kind: Kind::Terrain,
+        max_error: 0.5,
+        rule: Rule::Smooth,
+        quantum: None,
+        patch_log2: 6,
+        memory: 1 << 30,
+    };
+    let report = hierarchy::build(&source, &store, &options, &Progress::new())?;
+    say(&format!(
+        "  {} diamonds, {} bytes, {:.2} bits a sample at 0.5 m, {:.1} s",
+        report.diamonds, report.point_bytes, report.bits_per_sample, report.seconds
+    ));
+    let server = match Server::open(std::slice::from_ref(&store), listen) {
+        Err(ServeError::Listen { error, .. }) if error.kind() == io::ErrorKind::AddrInUse => {
+            say(&format!("Port {} is taken; using a free one.", listen.port()));
+            Server::open(std::slice::from_ref(&store), SocketAddr::new(listen.ip(), 0))?
+        }
+        other => other?,
+    };
+    let url = format!("{}/scenes/sample", server.address());
+    let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
+    std::thread::scope(|scope| {
+        let serving = scope.spawn(move || {
+            server.run(async move {
+                // Dropped or sent, it means the same.
+                let _ = stopped.await;
+            })
+        });
+        let drawn = draw(&client, &url, &picture);
+        if drawn.is_ok() {
+            say(&format!("Picture: {}\nServing {url}", picture.display()));
+            let program = client.display();
+            say("Go on with, for instance:");
+            say(&format!("  {program} render {url} -o near.png --eye 655000,7955000,4200 --target 661000,7966000,1000"));
+            say(&format!("  curl '{url}/terrain/height?x=660000&y=7966000'"));
+        }
+        if drawn.is_ok() && !headless {
+            say("Press Ctrl-C to end.");
+            wait_for_interrupt();
+        }
+        let _ = stop.send(());
+        let served = serving.join().unwrap_or(Ok(()));
+        drawn.and(served.map_err(DemoError::from))
+    })
+}
+
+fn draw(client: &Path, url: &str, picture: &Path) -> Result<(), DemoError> {
+    let status = Command::new(client).arg("render").arg(url).arg("-o").arg(picture).status();
+    match status {
+        Ok(status) if status.success() => Ok(()),
+        Ok(_) => Err(DemoError::Client),
+        Err(error) => Err(DemoError::Io { path: client.to_owned(), error }),
+    }
+}
+
+fn wait_for_interrupt() {
+    if let Ok(runtime) = tokio::runtime::Builder::new_current_thread().enable_all().build() {
+        // Without a signal handler the default one ends the process: as good.
+        let _ = runtime.block_on(tokio::signal::ctrl_c());
+    }
+}
+
+fn say(line: &str) {
+    // Standard output may be closed; the work goes on.
+    let _ = writeln!(io::stdout(), "{line}");
+}

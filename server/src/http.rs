@@ -1,0 +1,422 @@
+//! Stores over HTTP. `router(stores)` is a plain function of what it serves; errors become statuses here
+//! and nowhere else.
+//!
+//! Everything under a version never changes, and says so to caches. Metadata is revalidated by its ETag.
+//! The handlers read from local files, which the system caches: a read takes microseconds, so only whole
+//! batches and heights leave the async threads.
+
+use crate::height::{self, HeightError};
+use crate::store::{Key, Kind, Store, StoreError};
+use axum::Router;
+use axum::body::{Body, Bytes};
+use axum::extract::{Path as UrlPath, Query, Request, State};
+use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
+use axum::middleware::{self, Next};
+use axum::response::{Html, IntoResponse, Response};
+use axum::routing::get;
+use diamantina_protocol::index;
+use diamantina_protocol::message::{self, BATCH_MAX, Catalogue, FrameHeader, Layer, PAYLOAD_BYTES_MAX, Problem, Scene, Status};
+use std::collections::{BTreeMap, HashMap};
+use std::io::{Read as _, Write as _};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// The longest that a shutdown waits for answers under way.
+const DRAIN: Duration = Duration::from_secs(10);
+
+/// Frames of a batch that may wait for a slow reader.
+const FRAMES_AHEAD: usize = 16;
+
+/// Why a server cannot start or stops.
+#[derive(Debug, thiserror::Error)]
+pub enum ServeError {
+    /// A store cannot be opened.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// Two stores hold scenes of one name.
+    #[error("{first} and {second} both hold a scene named '{name}': build one of them again with another --scene NAME")]
+    SameName {
+        /// The name.
+        name: String,
+        /// A store.
+        first: PathBuf,
+        /// Another.
+        second: PathBuf,
+    },
+    /// The address cannot be listened on.
+    #[error("cannot listen on {address}: {error}{}", match error.kind() {
+        std::io::ErrorKind::AddrInUse => "; another program has that port: choose another with --listen, for instance --listen 127.0.0.1:0 for any free one",
+        std::io::ErrorKind::PermissionDenied => "; ports below 1024 need rights: choose a higher one with --listen",
+        std::io::ErrorKind::AddrNotAvailable => "; this machine does not have that address: choose another with --listen",
+        _ => "",
+    })]
+    Listen {
+        /// The address.
+        address: SocketAddr,
+        /// What the system said.
+        error: std::io::Error,
+    },
+    /// The server's loop failed.
+    #[error("server: {0}")]
+    Run(#[from] std::io::Error),
+}
+
+/// Scenes by name.
+type Scenes = Arc<BTreeMap<String, Arc<Store>>>;
+
+/// A server that has its stores open and its port bound.
+#[derive(Debug)]
+pub struct Server {
+    scenes: Scenes,
+    listener: TcpListener,
+    address: SocketAddr,
+}
+
+impl Server {
+    /// Opens the stores and binds the address; port 0 takes a free one.
+    ///
+    /// # Errors
+    /// When a store is missing or damaged, or the port is in use.
+    pub fn open(stores: &[PathBuf], listen: SocketAddr) -> Result<Self, ServeError> {
+        let mut scenes: BTreeMap<String, Arc<Store>> = BTreeMap::new();
+        for path in stores {
+            let store = Store::open(path)?;
+            let name = store.scene().name.clone();
+            if let Some(first) = scenes.get(&name) {
+                let (first, second) = (first.root().to_owned(), path.clone());
+                return Err(ServeError::SameName { name, first, second });
+            }
+            scenes.insert(name, Arc::new(store));
+        }
+        let failed = |error| ServeError::Listen { address: listen, error };
+        let listener = TcpListener::bind(listen).map_err(failed)?;
+        listener.set_nonblocking(true).map_err(failed)?;
+        let address = listener.local_addr().map_err(failed)?;
+        Ok(Self { scenes: Arc::new(scenes), listener, address })
+    }
+
+    /// Where the server listens, as a URL.
+    #[must_use]
+    pub fn address(&self) -> String {
+        format!("http://{}", self.address)
+    }
+
+    /// The names of its scenes.
+    #[must_use]
+    pub fn scenes(&self) -> Vec<String> {
+        self.scenes.keys().cloned().collect()
+    }
+
+    /// Serves until the process is interrupted or terminated, then lets answers under way end.
+    ///
+    /// # Errors
+    /// When the async runtime cannot start.
+    pub fn run_until_signal(self) -> Result<(), ServeError> {
+        self.run(async {
+            let interrupted = tokio::signal::ctrl_c();
+            let terminated = async {
+                match tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate()) {
+                    Ok(mut signal) => signal.recv().await,
+                    Err(_) => std::future::pending().await,
+                }
+            };
+            tokio::select! { _ = interrupted => {}, _ = terminated => {} }
+        })
+    }
+
+    /// Serves until `stop` is done.
+    ///
+    /// # Errors
+    /// When the async runtime cannot start.
+    pub fn run(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), ServeError> {
+        let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+        runtime.block_on(async move {
+            let listener = tokio::net::TcpListener::from_std(self.listener)?;
+            let (stopping, stopped) = tokio::sync::oneshot::channel();
+            let signalled = async move {
+                stop.await;
+                let _ = stopping.send(());
+            };
+            let serving = axum::serve(listener, router(self.scenes)).with_graceful_shutdown(signalled).into_future();
+            let deadline = async move {
+                // Connections that stay open for nothing do not keep the process.
+                if stopped.await.is_err() {
+                    std::future::pending::<()>().await;
+                }
+                tokio::time::sleep(DRAIN).await;
+            };
+            tokio::select! { served = serving => served?, () = deadline => {} }
+            Ok(())
+        })
+    }
+}
+
+/// Asks the server at `address` whether it is well.
+///
+/// # Errors
+/// When it does not say so within five seconds.
+pub fn ask_health(address: SocketAddr) -> Result<(), String> {
+    let patience = Duration::from_secs(5);
+    let ask = || -> std::io::Result<String> {
+        let mut stream = TcpStream::connect_timeout(&address, patience)?;
+        stream.set_read_timeout(Some(patience))?;
+        write!(stream, "GET /health HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n")?;
+        let mut answer = String::new();
+        stream.take(4096).read_to_string(&mut answer)?;
+        Ok(answer)
+    };
+    match ask() {
+        Ok(answer) if answer.starts_with("HTTP/1.1 200") => Ok(()),
+        Ok(answer) => Err(format!("{address}: not well: {}", answer.lines().next().unwrap_or("no answer"))),
+        Err(e) => Err(format!("{address}: no answer ({e}): is the server running there?")),
+    }
+}
+
+/// The requests that the scenes answer.
+pub fn router(scenes: Scenes) -> Router {
+    Router::new()
+        .route("/", get(front_page))
+        .route("/health", get(|| async { "ok\n" }))
+        .route("/ready", get(|| async { "ok\n" }))
+        .route("/scenes", get(catalogue))
+        .route("/scenes/{scene}", get(scene))
+        .route("/scenes/{scene}/{layer}/height", get(height_at))
+        .route("/scenes/{scene}/{version}/{layer}/index/{page}", get(index_page))
+        .route("/scenes/{scene}/{version}/{layer}/points", get(batch))
+        .route("/scenes/{scene}/{version}/{layer}/points/{x}/{y}", get(diamond))
+        .fallback(|| async { Refusal::new(StatusCode::NOT_FOUND, "no such address: GET /scenes lists what there is") })
+        .method_not_allowed_fallback(|| async { Refusal::new(StatusCode::METHOD_NOT_ALLOWED, "only GET and HEAD are answered") })
+        .layer(middleware::from_fn(common_headers))
+        .with_state(scenes)
+}
+
+/// A refusal, sent as problem+json (RFC 9457).
+struct Refusal {
+    status: StatusCode,
+    detail: String,
+}
+
+impl Refusal {
+    fn new(status: StatusCode, detail: impl Into<String>) -> Self {
+        Self { status, detail: detail.into() }
+    }
+}
+
+impl IntoResponse for Refusal {
+    fn into_response(self) -> Response {
+        let title = self.status.canonical_reason().unwrap_or("Error").to_owned();
+        let problem = Problem { title, status: self.status.as_u16(), detail: self.detail };
+        let body = serde_json::to_vec(&problem).unwrap_or_default();
+        let headers = [(header::CONTENT_TYPE, "application/problem+json"), (header::CACHE_CONTROL, "no-store")];
+        (self.status, headers, body).into_response()
+    }
+}
+
+impl From<StoreError> for Refusal {
+    fn from(error: StoreError) -> Self {
+        // The log names the blob; the answer does not tell strangers about our disks.
+        tracing::error!(%error, "store");
+        Self::new(StatusCode::INTERNAL_SERVER_ERROR, "the store is damaged here: the log says where")
+    }
+}
+
+/// Headers that every answer has: any page may read it, and no proxy may guess its type.
+async fn common_headers(request: Request, next: Next) -> Response {
+    let refused = !matches!(*request.method(), Method::GET | Method::HEAD | Method::OPTIONS);
+    let mut response = next.run(request).await;
+    let headers = response.headers_mut();
+    headers.insert(header::ACCESS_CONTROL_ALLOW_ORIGIN, HeaderValue::from_static("*"));
+    headers.insert(header::ACCESS_CONTROL_EXPOSE_HEADERS, HeaderValue::from_static("etag, content-length"));
+    headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
+    if refused {
+        headers.insert(header::ALLOW, HeaderValue::from_static("GET, HEAD"));
+    }
+    response
+}
+
+/// An answer with an ETag, or 304 where the client has it already.
+fn tagged(headers: &HeaderMap, tag: &str, cache: &'static str, kind: &'static str, body: impl FnOnce() -> Bytes) -> Response {
+    let tag = format!("\"{tag}\"");
+    let known = headers.get_all(header::IF_NONE_MATCH).iter().filter_map(|v| v.to_str().ok());
+    let fresh = known.flat_map(|v| v.split(',')).any(|v| matches!(v.trim(), "*") || v.trim().trim_start_matches("W/") == tag);
+    let common = [(header::ETAG, tag), (header::CACHE_CONTROL, cache.to_owned())];
+    if fresh {
+        return (StatusCode::NOT_MODIFIED, common).into_response();
+    }
+    (common, [(header::CONTENT_TYPE, kind)], body()).into_response()
+}
+
+const IMMUTABLE: &str = "public, max-age=31536000, immutable";
+const OCTETS: &str = "application/octet-stream";
+
+fn json(headers: &HeaderMap, value: &impl serde::Serialize) -> Response {
+    let body = serde_json::to_vec(value).unwrap_or_default();
+    let hash = blake3::hash(&body).to_hex();
+    tagged(headers, &hash[..16], "no-cache", "application/json", || body.into())
+}
+
+async fn front_page(State(scenes): State<Scenes>) -> Html<String> {
+    let mut page = String::from(
+        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content=\"width=device-width\"><title>Diamantina</title>\
+         <style>body{font:16px/1.5 system-ui;max-width:44rem;margin:3rem auto;padding:0 1rem}code{background:#eee;padding:.1em .3em}</style>\
+         <h1>Diamantina</h1><p>This server streams terrain. Open a scene with the client:</p><ul>",
+    );
+    for name in scenes.keys() {
+        // Names are letters, digits, '-', '_' and '.': nothing to escape.
+        page += &format!("<li><a href=/scenes/{name}>{name}</a> <code>diamantina-client render http://THIS-SERVER/scenes/{name} -o {name}.png</code>");
+    }
+    page += "</ul><p><a href=/scenes>All scenes as JSON</a></html>";
+    Html(page)
+}
+
+async fn catalogue(State(scenes): State<Scenes>, headers: HeaderMap) -> Response {
+    let scenes: Vec<Scene> = scenes.values().map(|s| s.scene().clone()).collect();
+    json(&headers, &Catalogue { scenes })
+}
+
+fn find_scene<'a>(scenes: &'a Scenes, name: &str) -> Result<&'a Arc<Store>, Refusal> {
+    scenes.get(name).ok_or_else(|| Refusal::new(StatusCode::NOT_FOUND, "no such scene: GET /scenes lists them"))
+}
+
+/// The layer of an address, with its number.
+fn find_layer<'a>(store: &'a Store, name: &str) -> Result<(u8, &'a Layer), Refusal> {
+    let found = store.scene().layers.iter().enumerate().find(|(_, l)| l.name == name);
+    let (number, layer) = found.ok_or_else(|| Refusal::new(StatusCode::NOT_FOUND, "no such layer in this scene"))?;
+    Ok((u8::try_from(number).unwrap_or(u8::MAX), layer))
+}
+
+/// The store of an address with a version.
+fn find_version<'a>(scenes: &'a Scenes, name: &str, version: &str) -> Result<&'a Arc<Store>, Refusal> {
+    let store = find_scene(scenes, name)?;
+    let current = &store.scene().version;
+    if current == version {
+        return Ok(store);
+    }
+    Err(Refusal::new(StatusCode::GONE, format!("scene '{name}' is now at version {current}: load its description again")))
+}
+
+async fn scene(State(scenes): State<Scenes>, UrlPath(name): UrlPath<String>, headers: HeaderMap) -> Result<Response, Refusal> {
+    Ok(json(&headers, find_scene(&scenes, &name)?.scene()))
+}
+
+async fn index_page(
+    State(scenes): State<Scenes>,
+    UrlPath((name, version, layer, page)): UrlPath<(String, String, String, String)>,
+    headers: HeaderMap,
+) -> Result<Response, Refusal> {
+    let store = find_version(&scenes, &name, &version)?;
+    let (number, layer) = find_layer(store, &layer)?;
+    let pages = index::pages(&layer.forest);
+    let missing = || Refusal::new(StatusCode::NOT_FOUND, format!("no such page: the index has pages 0 to {}", pages - 1));
+    let page: u32 = page.parse().map_err(|_| missing())?;
+    let blob = store.get(Key { layer: number, kind: Kind::Index, a: page, b: 0 })?.ok_or_else(missing)?;
+    Ok(tagged(&headers, &format!("{version}-{number}-i{page}"), IMMUTABLE, OCTETS, || blob))
+}
+
+async fn diamond(
+    State(scenes): State<Scenes>,
+    UrlPath((name, version, layer, x, y)): UrlPath<(String, String, String, String, String)>,
+    headers: HeaderMap,
+) -> Result<Response, Refusal> {
+    let store = find_version(&scenes, &name, &version)?;
+    let (number, layer) = find_layer(store, &layer)?;
+    let no_diamond = || Refusal::new(StatusCode::NOT_FOUND, "no diamond with a payload has its centre there");
+    let centre = [x.parse().map_err(|_| no_diamond())?, y.parse().map_err(|_| no_diamond())?];
+    layer.forest.diamond(centre).ok_or_else(no_diamond)?;
+    let blob = store.get(Key { layer: number, kind: Kind::Points, a: centre[0], b: centre[1] })?.ok_or_else(no_diamond)?;
+    Ok(tagged(&headers, &format!("{version}-{number}-p{x}-{y}"), IMMUTABLE, OCTETS, || blob))
+}
+
+async fn batch(
+    State(scenes): State<Scenes>,
+    UrlPath((name, version, layer)): UrlPath<(String, String, String)>,
+    Query(query): Query<HashMap<String, String>>,
+) -> Result<Response, Refusal> {
+    let store = Arc::clone(find_version(&scenes, &name, &version)?);
+    let (number, forest) = {
+        let (number, layer) = find_layer(&store, &layer)?;
+        (number, layer.forest)
+    };
+    let list = query.get("d").ok_or_else(|| Refusal::new(StatusCode::BAD_REQUEST, "expected ?d=x,y;x,y;..."))?;
+    let centres = message::parse_batch(list).map_err(|e| match e {
+        message::BatchError::Many => Refusal::new(StatusCode::PAYLOAD_TOO_LARGE, format!("at most {BATCH_MAX} diamonds in one request")),
+        message::BatchError::Syntax(_) => Refusal::new(StatusCode::BAD_REQUEST, e.to_string()),
+    })?;
+    // Coarse first, so that whatever arrives can be decoded; unknown centres last.
+    let mut order: Vec<_> = centres.into_iter().map(|c| (forest.diamond(c).map_or(u32::MAX, |d| d.level()), c)).collect();
+    order.sort_by_key(|(level, _)| *level);
+    let (sender, receiver) = tokio::sync::mpsc::channel::<Result<Bytes, std::io::Error>>(FRAMES_AHEAD);
+    tokio::task::spawn_blocking(move || {
+        for (_, centre) in order {
+            // The reader went away: stop reading for it.
+            if sender.blocking_send(Ok(batch_frame(&store, number, centre))).is_err() {
+                break;
+            }
+        }
+    });
+    let frames = futures_util::stream::unfold(receiver, |mut r| async move { r.recv().await.map(|frame| (frame, r)) });
+    let headers = [(header::CONTENT_TYPE, OCTETS), (header::CACHE_CONTROL, IMMUTABLE)];
+    Ok((headers, Body::from_stream(frames)).into_response())
+}
+
+/// One frame of a batch: header and payload.
+fn batch_frame(store: &Store, layer: u8, centre: [u32; 2]) -> Bytes {
+    let blob = store.get(Key { layer, kind: Kind::Points, a: centre[0], b: centre[1] });
+    let mut out = Vec::new();
+    match blob {
+        Ok(Some(payload)) if payload.len() as u64 <= u64::from(PAYLOAD_BYTES_MAX) => {
+            out.reserve(payload.len() + message::FRAME_HEADER_BYTES_MAX);
+            FrameHeader::of(centre, &payload).write(&mut out);
+            out.extend_from_slice(&payload);
+        }
+        Ok(None) => FrameHeader::without(centre, Status::Missing).write(&mut out),
+        Ok(Some(_)) => FrameHeader::without(centre, Status::Damaged).write(&mut out),
+        Err(error) => {
+            tracing::error!(%error, ?centre, "store");
+            FrameHeader::without(centre, Status::Damaged).write(&mut out);
+        }
+    }
+    out.into()
+}
+
+async fn height_at(
+    State(scenes): State<Scenes>,
+    UrlPath((name, layer)): UrlPath<(String, String)>,
+    Query(query): Query<HashMap<String, String>>,
+) -> Result<Response, Refusal> {
+    let store = Arc::clone(find_scene(&scenes, &name)?);
+    find_layer(&store, &layer)?;
+    let number = |key: &str| -> Result<Option<f64>, Refusal> {
+        let Some(text) = query.get(key) else { return Ok(None) };
+        let value = text.parse::<f64>().ok().filter(|v| v.is_finite());
+        value.map(Some).ok_or_else(|| Refusal::new(StatusCode::BAD_REQUEST, format!("{key} is not a number")))
+    };
+    let asked = (number("x")?, number("y")?, number("lon")?, number("lat")?);
+    let answer = tokio::task::spawn_blocking(move || {
+        let crs = store.scene().frame.crs.as_ref();
+        let place = match asked {
+            (Some(x), Some(y), None, None) => [x, y],
+            (None, None, Some(lon), Some(lat)) => height::to_frame(crs, lon, lat).map_err(refuse_height)?,
+            _ => return Err(Refusal::new(StatusCode::BAD_REQUEST, "expected ?x=&y= in metres or ?lon=&lat= in degrees")),
+        };
+        let (number, layer) = find_layer(&store, &layer)?;
+        height::height(&store, number, layer, crs, place).map_err(refuse_height)
+    });
+    let answer = answer.await.map_err(|_| Refusal::new(StatusCode::INTERNAL_SERVER_ERROR, "the height could not be computed"))??;
+    Ok(([(header::CACHE_CONTROL, "no-cache")], axum::Json(answer)).into_response())
+}
+
+fn refuse_height(error: HeightError) -> Refusal {
+    match error {
+        HeightError::Outside { .. } | HeightError::NoProjection(_) | HeightError::Unprojectable { .. } => {
+            Refusal::new(StatusCode::NOT_FOUND, error.to_string())
+        }
+        HeightError::Store(e) => e.into(),
+        HeightError::Damaged(_) => {
+            tracing::error!(%error, "height");
+            Refusal::new(StatusCode::INTERNAL_SERVER_ERROR, "the store is damaged here: the log says where")
+        }
+    }
+}

@@ -1,0 +1,219 @@
+//! GeoKeys of a TIFF → a CRS, a vertical unit and where a sample lies in its cell.
+//!
+//! After OGC GeoTIFF 1.1 (19-008r4). A directory of 16-bit numbers (tag 34735) points into lists of
+//! doubles (34736) and text (34737). Value 32767 means "defined by the other keys".
+
+use std::collections::HashMap;
+use std::fmt::Write;
+use std::path::Path;
+
+use super::error::{Result, unsupported};
+use super::raster::SourceCrs;
+use super::tiff_header::{Header, VALUES_MAX};
+use crate::projection;
+
+const USER_DEFINED: u64 = 32767;
+
+/// What the keys say.
+pub(super) struct GeoKeys {
+    pub(super) crs: Option<SourceCrs>,
+    /// True when the tie point is a sample, not the corner of a cell.
+    pub(super) sample_is_point: bool,
+    /// Metres in one unit of height, where the file says it.
+    pub(super) vertical_metres: Option<f64>,
+}
+
+struct Keys {
+    shorts: HashMap<u64, u64>,
+    doubles: HashMap<u64, f64>,
+    texts: HashMap<u64, String>,
+}
+
+impl GeoKeys {
+    pub(super) fn read(path: &Path, header: &Header<'_>) -> Result<Self> {
+        let keys = Keys::read(header)?;
+        Ok(Self {
+            crs: keys.crs(path)?,
+            sample_is_point: keys.short(1025) == Some(2),
+            vertical_metres: keys.short(4099).and_then(linear_metres),
+        })
+    }
+}
+
+impl Keys {
+    fn read(header: &Header<'_>) -> Result<Self> {
+        let directory = header.integers(34735, VALUES_MAX)?;
+        let doubles = header.reals(34736, VALUES_MAX)?;
+        let text = header.text(34737)?.unwrap_or_default();
+        let mut keys = Self { shorts: HashMap::new(), doubles: HashMap::new(), texts: HashMap::new() };
+        for key in directory.as_chunks::<4>().0.iter().skip(1) {
+            let [id, place, count, value] = *key;
+            let from = usize::try_from(value).unwrap_or(usize::MAX);
+            match place {
+                0 => drop(keys.shorts.insert(id, value)),
+                34736 => {
+                    if let Some(v) = doubles.get(from).filter(|v| v.is_finite()) {
+                        keys.doubles.insert(id, *v);
+                    }
+                }
+                34737 => {
+                    let count = usize::try_from(count).unwrap_or(0);
+                    let piece = text.get(from..from.saturating_add(count).min(text.len())).unwrap_or("");
+                    keys.texts.insert(id, piece.trim_matches(['|', ' ', '\0']).to_owned());
+                }
+                _ => {}
+            }
+        }
+        Ok(keys)
+    }
+
+    fn short(&self, key: u64) -> Option<u64> {
+        self.shorts.get(&key).copied()
+    }
+
+    fn double(&self, key: u64) -> Option<f64> {
+        self.doubles.get(&key).copied()
+    }
+
+    /// An EPSG code; absent, zero and "user-defined" are all `None`.
+    fn code(&self, key: u64) -> Option<u32> {
+        let value = self.short(key).filter(|v| !matches!(*v, 0 | USER_DEFINED | 65535))?;
+        u32::try_from(value).ok()
+    }
+
+    fn crs(&self, path: &Path) -> Result<Option<SourceCrs>> {
+        let projected = self.short(3072).is_some() && self.short(1024) != Some(2);
+        let geographic = self.short(2048).is_some();
+        if self.short(1024) == Some(3) {
+            return Err(unsupported(
+                path,
+                "a geographic or projected CRS",
+                "geocentric coordinates",
+                "reproject it, for instance with gdalwarp -t_srs EPSG:4326",
+            ));
+        }
+        if projected {
+            return Ok(Some(self.projected()));
+        }
+        if !geographic {
+            return Ok(None);
+        }
+        Ok(Some(match self.code(2048) {
+            Some(code) => SourceCrs::epsg(code, true),
+            None => SourceCrs::new(
+                self.citation(&[2049, 1026], "geographic"),
+                Some(format!("+proj=longlat {} +no_defs", self.datum())),
+                true,
+            ),
+        }))
+    }
+
+    fn projected(&self) -> SourceCrs {
+        let unit = match self.short(3076) {
+            Some(USER_DEFINED) => self.double(3077),
+            Some(code) => linear_metres(code),
+            None => None,
+        }
+        .filter(|m| *m > 0.0);
+        let mut crs = match self.code(3072) {
+            Some(code) => SourceCrs::epsg(code, false),
+            None => {
+                let proj4 = self
+                    .projection(unit.unwrap_or(1.0))
+                    .map(|text| format!("{text} {} +no_defs", self.datum()));
+                let name = self.citation(&[3073, 1026], proj4.as_deref().unwrap_or("unnamed projection"));
+                SourceCrs::new(name, proj4, false)
+            }
+        };
+        // The unit of the coordinates may differ from the definition's; the keys win, as in GDAL.
+        if let Some(metres) = unit.filter(|m| (m / crs.metres_per_unit - 1.0).abs() > 1e-9) {
+            if let Some(text) = &mut crs.proj4 {
+                let words = text.split_whitespace();
+                let kept = words.filter(|w| !w.starts_with("+units=") && !w.starts_with("+to_meter="));
+                *text = format!("{} +to_meter={metres}", kept.collect::<Vec<_>>().join(" "));
+            }
+            crs.metres_per_unit = metres;
+        }
+        crs
+    }
+
+    /// The first citation that says something.
+    fn citation(&self, keys: &[u64], otherwise: &str) -> String {
+        let said = keys.iter().filter_map(|k| self.texts.get(k));
+        let mut said = said.filter(|t| !t.is_empty() && !t.to_lowercase().contains("unknown"));
+        said.next().map_or(otherwise, String::as_str).to_owned()
+    }
+
+    /// Ellipsoid, datum and prime meridian as PROJ words.
+    fn datum(&self) -> String {
+        if let Some(known) = self.code(2048).and_then(projection::epsg) {
+            let words = known.split_whitespace();
+            let words = words.filter(|w| !w.starts_with("+proj=") && !w.starts_with("+no_defs"));
+            return words.collect::<Vec<_>>().join(" ");
+        }
+        let a = self.double(2057).filter(|a| *a > 0.0);
+        let b = self.double(2058).filter(|b| *b > 0.0);
+        let rf = self.double(2059).filter(|rf| *rf > 0.0);
+        let mut text = match (a, b, rf) {
+            (Some(a), Some(b), _) if a == b => format!("+R={a}"),
+            (Some(a), Some(b), _) => format!("+a={a} +b={b}"),
+            (Some(a), None, Some(rf)) => format!("+a={a} +rf={rf}"),
+            (Some(a), None, None) => format!("+R={a}"),
+            (None, ..) => match self.short(2056) {
+                Some(7019) => "+ellps=GRS80".to_owned(),
+                Some(7008) => "+ellps=clrk66".to_owned(),
+                _ => "+datum=WGS84".to_owned(),
+            },
+        };
+        if let Some(pm) = self.double(2061).filter(|pm| *pm != 0.0) {
+            // Writing to a String cannot fail.
+            let _ = write!(text, " +pm={pm}");
+        }
+        text
+    }
+
+    /// The projection and its parameters as PROJ words; `None` for methods that are not known here.
+    fn projection(&self, unit_metres: f64) -> Option<String> {
+        match self.short(3074) {
+            Some(code @ 16001..=16060) => return Some(format!("+proj=utm +zone={}", code - 16000)),
+            Some(code @ 16101..=16160) => return Some(format!("+proj=utm +zone={} +south", code - 16100)),
+            _ => {}
+        }
+        let first = |keys: &[u64]| keys.iter().find_map(|k| self.double(*k)).unwrap_or(0.0);
+        let lon = first(&[3080, 3084, 3088, 3095]);
+        let lat = first(&[3081, 3085, 3089]);
+        let (lat_1, lat_2) = (first(&[3078]), first(&[3079]));
+        let k = self.double(3092).or(self.double(3093)).unwrap_or(1.0);
+        // Keys are in the file's unit, PROJ's false origins always in metres.
+        let x = first(&[3082, 3086, 3090]) * unit_metres;
+        let y = first(&[3083, 3087, 3091]) * unit_metres;
+        let method = match self.short(3075)? {
+            1 => format!("+proj=tmerc +lat_0={lat} +lon_0={lon} +k={k}"),
+            7 if self.double(3078).is_some() => format!("+proj=merc +lat_ts={lat_1} +lon_0={lon}"),
+            7 => format!("+proj=merc +lon_0={lon} +k={k}"),
+            8 => format!("+proj=lcc +lat_1={lat_1} +lat_2={lat_2} +lat_0={lat} +lon_0={lon}"),
+            9 => format!("+proj=lcc +lat_1={lat} +lat_0={lat} +lon_0={lon} +k_0={k}"),
+            10 => format!("+proj=laea +lat_0={lat} +lon_0={lon}"),
+            11 => format!("+proj=aea +lat_1={lat_1} +lat_2={lat_2} +lat_0={lat} +lon_0={lon}"),
+            15 if lat < 0.0 => format!("+proj=stere +lat_0=-90 +lat_ts={lat} +lon_0={lon} +k={k}"),
+            15 => format!("+proj=stere +lat_0=90 +lat_ts={lat} +lon_0={lon} +k={k}"),
+            17 => format!("+proj=eqc +lat_ts={lat_1} +lat_0={lat} +lon_0={lon}"),
+            _ => return None,
+        };
+        Some(format!("{method} +x_0={x} +y_0={y}"))
+    }
+}
+
+/// Metres in a linear unit of measure, by its EPSG code.
+fn linear_metres(code: u64) -> Option<f64> {
+    Some(match code {
+        9001 => 1.0,
+        9002 => 0.3048,
+        9003 => 1200.0 / 3937.0,
+        9005 => 0.304_797_265_4,
+        9030 => 1852.0,
+        9036 => 1000.0,
+        9096 => 0.9144,
+        _ => return None,
+    })
+}

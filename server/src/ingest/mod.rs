@@ -1,0 +1,553 @@
+//! DEM files → heights, window by window: one layer from one or several rasters.
+//!
+//! `open` finds each file's format by its content, joins the files to a mosaic on one grid and, where
+//! asked, plans a reprojection; `Source::read` then answers any window from any thread. Nothing is ever
+//! read whole: TIFFs are read by strip or tile, other formats by position; what can only be read from
+//! start to end is transcribed once to a temporary file (8 bytes a sample, 1 or 2 for PNG).
+//!
+//! ```text
+//! geotiff hgt ascii_grid usgs_dem png raw → raster → mosaic → (as it is | reproject) → windows
+//! ```
+//!
+//! Files may be hostile: every size is checked before memory is taken, and what is wrong is an
+//! [`IngestError`] that names the file, what was expected, what was found and the remedy.
+
+mod ascii_grid;
+mod error;
+mod geokeys;
+mod geotiff;
+mod hgt;
+mod mosaic;
+mod png;
+mod raster;
+mod reproject;
+mod samples;
+#[cfg(test)]
+mod tests;
+mod tiff_header;
+mod usgs_dem;
+
+use std::fmt;
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom, Write};
+use std::os::unix::fs::FileExt;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+use std::sync::Arc;
+
+pub use error::IngestError;
+
+use crate::projection;
+use error::{Result, broken, io_error, options as bad_options, unsupported};
+use geotiff::ChunkCache;
+use mosaic::Mosaic;
+use raster::{Dtype, Place, Raster, SIDE_MAX, Samples, SourceCrs, Window};
+use reproject::Reprojection;
+use samples::{Order, SampleFile};
+
+/// Decoded strips and tiles kept for one layer.
+const CACHE_BYTES: usize = 128 << 20;
+/// What a gzip may unpack to: some 600 of the largest `.hgt`.
+const UNPACKED_BYTES_MAX: u64 = 64 << 30;
+/// Widest geographic source that one UTM zone may carry, degrees; the scale is 6 % off at its rims.
+const UTM_DEGREES_MAX: f64 = 40.0;
+
+/// What the command line may say about sources.
+#[derive(Clone, Debug, Default, clap::Args)]
+pub struct Options {
+    /// CRS of the frame: auto (degrees go to the UTM zone of the centre, metres stay), source (never
+    /// resampled) or EPSG:N (resampled bilinearly)
+    #[arg(long, value_name = "auto|source|EPSG:N", default_value_t = CrsChoice::Auto)]
+    pub crs: CrsChoice,
+    /// Metres between samples, when reprojecting or for a source that does not say (PNG, raw)
+    #[arg(long, value_name = "METRES")]
+    pub cell: Option<f64>,
+    /// Metres of height in one unit of value [default: from the file, else 1]
+    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
+    pub height_scale: Option<f64>,
+    /// Metres of height at value 0 [default: from the file, else 0]
+    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
+    pub height_offset: Option<f64>,
+    /// The value that means "no data", instead of the file's
+    #[arg(long, value_name = "VALUE", allow_negative_numbers = true)]
+    pub nodata: Option<f64>,
+    /// Read the files as bare little-endian samples, rows from the north; types u8 i16 u16 i32 u32 f32 f64
+    #[arg(long, value_name = "WIDTHxHEIGHT:TYPE")]
+    pub raw: Option<RawShape>,
+}
+
+/// Which CRS the frame has.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum CrsChoice {
+    /// Geographic sources go to the UTM zone of their centre, others stay as they are.
+    #[default]
+    Auto,
+    /// The source's own grid, never resampled.
+    Source,
+    /// A projected CRS by its EPSG code.
+    Epsg(u32),
+}
+
+impl FromStr for CrsChoice {
+    type Err = String;
+
+    fn from_str(text: &str) -> std::result::Result<Self, String> {
+        let lower = text.to_ascii_lowercase();
+        match (lower.as_str(), lower.strip_prefix("epsg:").map(str::parse)) {
+            ("auto", _) => Ok(Self::Auto),
+            ("source", _) => Ok(Self::Source),
+            (_, Some(Ok(code))) => Ok(Self::Epsg(code)),
+            _ => Err(format!("expected auto, source or EPSG:N, found '{text}'")),
+        }
+    }
+}
+
+impl fmt::Display for CrsChoice {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Auto => f.write_str("auto"),
+            Self::Source => f.write_str("source"),
+            Self::Epsg(code) => write!(f, "EPSG:{code}"),
+        }
+    }
+}
+
+/// Shape of a file of bare samples.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RawShape {
+    width: u32,
+    height: u32,
+    dtype: Dtype,
+}
+
+impl FromStr for RawShape {
+    type Err = String;
+
+    fn from_str(text: &str) -> std::result::Result<Self, String> {
+        let shape = || {
+            let (size, kind) = text.split_once(':')?;
+            let (width, height) = size.split_once(['x', 'X'])?;
+            let side = |s: &str| s.parse().ok().filter(|v| (1..=SIDE_MAX).contains(v));
+            let kinds = [Dtype::U8, Dtype::I16, Dtype::U16, Dtype::I32, Dtype::U32, Dtype::F32, Dtype::F64];
+            let dtype = kinds.into_iter().find(|d| d.name() == kind)?;
+            Some(Self { width: side(width)?, height: side(height)?, dtype })
+        };
+        shape().ok_or_else(|| {
+            format!(
+                "expected WIDTHxHEIGHT:TYPE, sides from 1 to {SIDE_MAX}, one of u8 i16 u16 i32 u32 f32 f64, \
+                 found '{text}'"
+            )
+        })
+    }
+}
+
+/// The lattice of a source's samples. x is east, y is north.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Grid {
+    /// Samples, west to east.
+    pub width: u32,
+    /// Samples, south to north.
+    pub height: u32,
+    /// Frame coordinates of the south-west sample, metres.
+    pub origin: [f64; 2],
+    /// Metres between samples along x and y; unequal for some sources that are not resampled.
+    pub cell: [f64; 2],
+    /// `None`: the source does not say.
+    pub crs: Option<Crs>,
+    /// Every value of the source is an integer. Where `resampled`, the values read are not.
+    pub integer: bool,
+    /// Metres of height in one unit of value.
+    pub height_scale: f64,
+    /// Metres of height at value 0.
+    pub height_offset: f64,
+    /// Values are interpolated between the source's samples.
+    pub resampled: bool,
+}
+
+/// A coordinate reference system and how the lattice lies in it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Crs {
+    /// Such as `EPSG:32611`, or what the file calls it.
+    pub name: String,
+    /// Definition for [`crate::projection::Projection`], where known.
+    pub proj4: Option<String>,
+    /// CRS coordinates of the south-west sample, CRS units (degrees, metres, feet).
+    pub origin: [f64; 2],
+    /// CRS units between samples along x and y.
+    pub step: [f64; 2],
+}
+
+/// One layer's heights, open for reading.
+///
+/// Holds one file handle a source file (and temporary files, which vanish with it), 16 bytes for each
+/// TIFF strip or tile, and at most 128 MiB of decoded ones for the whole layer.
+pub struct Source {
+    grid: Grid,
+    mosaic: Mosaic,
+    reprojection: Option<Reprojection>,
+}
+
+impl fmt::Debug for Source {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Source").field("grid", &self.grid).finish_non_exhaustive()
+    }
+}
+
+/// Opens one or several files as one layer. Sequential formats are read through once, TIFFs and raw files
+/// only at their headers.
+///
+/// # Errors
+/// When a file is missing, damaged, of an unknown kind, does not fit the others or the options.
+pub fn open(paths: &[PathBuf], options: &Options) -> std::result::Result<Source, IngestError> {
+    let first = paths.first().ok_or(IngestError::NoInput)?;
+    check_numbers(first, options)?;
+    let cache = Arc::new(ChunkCache::new(CACHE_BYTES));
+    let mut rasters = Vec::with_capacity(paths.len());
+    for (id, path) in (0..).zip(paths) {
+        let mut raster = open_file(path, options, &cache, id)?;
+        override_values(&mut raster, options)?;
+        rasters.push(raster);
+    }
+    let mosaic = Mosaic::new(rasters)?;
+    let (grid, reprojection) = frame(first, &mosaic, options)?;
+    Ok(Source { grid, mosaic, reprojection })
+}
+
+impl Source {
+    /// The lattice that windows refer to.
+    #[must_use]
+    pub fn grid(&self) -> &Grid {
+        &self.grid
+    }
+
+    /// Values (source units, NaN for nodata) of the window whose south-west sample is (`x0`, `y0`), row by
+    /// row from the south, each from west to east. `out` is replaced. Any threads may read at once.
+    ///
+    /// Memory beside `out`'s 8 bytes a sample: the cache of the layer, one strip or tile while it is
+    /// decoded, a copy of the window for a mosaic, 10 MiB when resampling.
+    ///
+    /// # Errors
+    /// When the window leaves the grid, or the file turns out damaged or unreadable.
+    pub fn read(
+        &self,
+        x0: u32,
+        y0: u32,
+        width: u32,
+        height: u32,
+        out: &mut Vec<f64>,
+    ) -> std::result::Result<(), IngestError> {
+        let fits = |from: u32, size: u32, all: u32| from.checked_add(size).is_some_and(|end| end <= all);
+        if !fits(x0, width, self.grid.width) || !fits(y0, height, self.grid.height) {
+            return Err(IngestError::Window {
+                width: self.grid.width,
+                height: self.grid.height,
+                found: format!("{width} x {height} at ({x0}, {y0})"),
+            });
+        }
+        let window = Window { x0, y0, width, height };
+        out.clear();
+        out.resize(window.samples(), f64::NAN);
+        if window.samples() == 0 {
+            return Ok(());
+        }
+        match &self.reprojection {
+            Some(reprojection) => reprojection.read(&self.mosaic, window, out),
+            None => self.mosaic.read(window, out),
+        }
+    }
+}
+
+fn check_numbers(file: &Path, options: &Options) -> Result<()> {
+    let bad = |what: &str, found: f64| {
+        Err(bad_options(file, format!("a finite, sensible {what}"), found.to_string(), "correct the option"))
+    };
+    match options {
+        Options { cell: Some(v), .. } if !(v.is_finite() && *v > 0.0) => bad("--cell above 0", *v),
+        Options { height_scale: Some(v), .. } if !v.is_finite() || *v == 0.0 => {
+            bad("--height-scale not 0", *v)
+        }
+        Options { height_offset: Some(v), .. } if !v.is_finite() => bad("--height-offset", *v),
+        _ => Ok(()),
+    }
+}
+
+/// Opens one file, whatever its format.
+fn open_file(path: &Path, options: &Options, cache: &Arc<ChunkCache>, id: u32) -> Result<Raster> {
+    let file = File::open(path).map_err(io_error(path, "open it"))?;
+    let metadata = file.metadata().map_err(io_error(path, "ask for its length"))?;
+    if metadata.is_dir() {
+        return Err(unsupported(path, "a DEM file", "a directory", "name the files in it"));
+    }
+    if let Some(shape) = options.raw {
+        return open_raw(path, file, shape);
+    }
+    let name = path.file_name().and_then(|n| n.to_str()).unwrap_or_default().to_ascii_lowercase();
+    let mut magic = [0; 2];
+    let gzipped = file.read_exact_at(&mut magic, 0).is_ok() && magic == [0x1f, 0x8b];
+    let (file, name) = if gzipped {
+        (unpack(path, file)?, name.strip_suffix(".gz").unwrap_or(&name).to_owned())
+    } else {
+        (file, name)
+    };
+    detect(path, file, &name, cache, id)
+}
+
+/// Chooses the format by content; `.hgt` alone has no mark of its own and goes by `name` (lower case).
+fn detect(path: &Path, file: File, name: &str, cache: &Arc<ChunkCache>, id: u32) -> Result<Raster> {
+    let mut start = vec![0; 1024];
+    let length = file.read_at(&mut start, 0).map_err(io_error(path, "read it"))?;
+    start.truncate(length);
+    let text = start.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&start).trim_ascii_start();
+    let text = text[..text.len().min(16)].to_ascii_lowercase();
+    match &start[..] {
+        [] => Err(broken(path, "a DEM", "an empty file", "fetch it again")),
+        _ if name.ends_with(".hgt") => hgt::open(path, file),
+        [b'I', b'I', 42 | 43, 0, ..] | [b'M', b'M', 0, 42 | 43, ..] => {
+            geotiff::open(path, file, Arc::clone(cache), id)
+        }
+        [0x89, b'P', b'N', b'G', ..] => png::open(path, file),
+        [b'P', b'K', 3 | 5, ..] => ascii_grid::open_zip(path, file),
+        _ if text.starts_with(b"ncols") || text.starts_with(b"nrows") => ascii_grid::open(path, file),
+        _ if usgs_dem::looks_like(&start) => usgs_dem::open(path, &file),
+        _ => {
+            let printable = text.iter().all(|b| b.is_ascii_graphic() || b.is_ascii_whitespace());
+            let found = if printable {
+                format!("text that begins with '{}'", String::from_utf8_lossy(&text).escape_default())
+            } else {
+                format!("bytes that begin with {:02x?}", &start[..start.len().min(8)])
+            };
+            Err(unsupported(
+                path,
+                "GeoTIFF, SRTM .hgt, Arc ASCII grid (or one in a zip), USGS ASCII DEM or greyscale PNG",
+                found,
+                "convert it to GeoTIFF, or describe bare samples with --raw WIDTHxHEIGHT:TYPE",
+            ))
+        }
+    }
+}
+
+/// Unpacks a gzip into a temporary file.
+fn unpack(path: &Path, file: File) -> Result<File> {
+    let mut unpacked = tempfile::tempfile().map_err(io_error(path, "create a temporary file"))?;
+    let mut reader = flate2::read::MultiGzDecoder::new(std::io::BufReader::new(file));
+    let mut buffer = vec![0; 1 << 18];
+    let mut total = 0;
+    loop {
+        let read = reader.read(&mut buffer).map_err(|e| {
+            broken(path, "a whole gzip", e.to_string(), "the file was cut short or damaged: fetch it again")
+        })?;
+        if read == 0 {
+            break;
+        }
+        total += read as u64;
+        if total > UNPACKED_BYTES_MAX {
+            let expected = format!("at most {UNPACKED_BYTES_MAX} bytes when unpacked");
+            return Err(broken(path, expected, "more", "unpack it and give the file itself"));
+        }
+        unpacked.write_all(&buffer[..read]).map_err(io_error(path, "write a temporary file"))?;
+    }
+    unpacked.seek(SeekFrom::Start(0)).map_err(io_error(path, "rewind a temporary file"))?;
+    Ok(unpacked)
+}
+
+fn open_raw(path: &Path, file: File, shape: RawShape) -> Result<Raster> {
+    let RawShape { width, height, dtype } = shape;
+    let samples = SampleFile { file, dtype, big_endian: false, order: Order::RowsFromNorth, width, height };
+    samples.check_length(path)?;
+    Ok(Raster {
+        file: path.to_owned(),
+        width,
+        height,
+        place: None,
+        dtype,
+        integer: dtype.is_integer(),
+        height_scale: 1.0,
+        height_offset: 0.0,
+        nodata: None,
+        samples: Samples::File(samples),
+    })
+}
+
+/// Applies what the command line says of values.
+fn override_values(raster: &mut Raster, options: &Options) -> Result<()> {
+    if let Some(nodata) = options.nodata {
+        raster.nodata = Some(raster.dtype.hold(nodata).ok_or_else(|| {
+            bad_options(
+                &raster.file,
+                format!("a --nodata that samples of type {} can hold", raster.dtype.name()),
+                nodata.to_string(),
+                "correct it, or leave it out to use the file's own",
+            )
+        })?);
+    }
+    raster.height_scale = options.height_scale.unwrap_or(raster.height_scale);
+    raster.height_offset = options.height_offset.unwrap_or(raster.height_offset);
+    Ok(())
+}
+
+/// Decides the frame: the source's own lattice or a resampled one.
+fn frame(file: &Path, mosaic: &Mosaic, options: &Options) -> Result<(Grid, Option<Reprojection>)> {
+    let Some(place) = &mosaic.place else {
+        if let CrsChoice::Epsg(code) = options.crs {
+            return Err(no_crs(file, &format!("EPSG:{code}")));
+        }
+        let cell = options.cell.ok_or_else(|| {
+            let found = "a file that does not say how far its samples are apart";
+            bad_options(file, "--cell METRES", found, "add --cell with the metres between samples")
+        })?;
+        return Ok((grid(mosaic, [0.0; 2], [cell; 2], None), None));
+    };
+    let target = match (options.crs, &place.crs) {
+        (CrsChoice::Source, _) | (CrsChoice::Auto, None) => None,
+        (CrsChoice::Auto, Some(crs)) if crs.geographic => Some(natural_crs(file, mosaic, place, crs)?),
+        (CrsChoice::Auto, Some(_)) => None,
+        (CrsChoice::Epsg(code), None) => return Err(no_crs(file, &format!("EPSG:{code}"))),
+        (CrsChoice::Epsg(code), Some(crs)) => {
+            let target = known_crs(file, code)?;
+            // The same CRS needs no resampling unless another cell is asked for.
+            (target.name != crs.name || options.cell.is_some()).then_some(target)
+        }
+    };
+    match target {
+        Some(target) => resampled(mosaic, place, &target, options.cell),
+        None if options.cell.is_some() => Err(bad_options(
+            file,
+            "--cell only with a reprojection",
+            "a source that keeps its own cells",
+            "leave --cell out, or say --crs EPSG:N",
+        )),
+        None => Ok((as_it_is(mosaic, place), None)),
+    }
+}
+
+fn no_crs(file: &Path, asked: &str) -> IngestError {
+    bad_options(
+        file,
+        format!("a source with a CRS, to reproject it to {asked}"),
+        "none in the file",
+        "leave --crs out, or add the CRS, for instance with gdal_edit.py -a_srs",
+    )
+}
+
+/// A projected CRS that the command line names.
+fn known_crs(file: &Path, code: u32) -> Result<SourceCrs> {
+    let crs = SourceCrs::epsg(code, false);
+    if crs.proj4.is_none() {
+        let expected = "--crs with a known EPSG code";
+        return Err(bad_options(
+            file,
+            expected,
+            crs.name,
+            "choose another code, such as EPSG:32632 for UTM 32 north",
+        ));
+    }
+    if crs.geographic {
+        let found = format!("{}, whose unit is the degree", crs.name);
+        return Err(bad_options(
+            file,
+            "--crs with a projected CRS",
+            found,
+            "use --crs source to keep degrees",
+        ));
+    }
+    Ok(crs)
+}
+
+/// Where degrees go unless told otherwise: the UTM zone of the centre, polar stereographic beyond UTM, and
+/// on other bodies a transverse Mercator about the centre.
+fn natural_crs(file: &Path, mosaic: &Mosaic, place: &Place, crs: &SourceCrs) -> Result<SourceCrs> {
+    let middle =
+        |axis: usize, samples: u32| place.origin[axis] + place.step[axis] * f64::from(samples - 1) / 2.0;
+    let lon = (middle(0, mosaic.width) + 180.0).rem_euclid(360.0) - 180.0;
+    let lat = middle(1, mosaic.height);
+    let degrees = place.step[0] * f64::from(mosaic.width);
+    let polar = !(-80.0..=84.0).contains(&lat);
+    if degrees > UTM_DEGREES_MAX && !polar {
+        return Err(bad_options(
+            file,
+            format!("a source at most {UTM_DEGREES_MAX} degrees wide for one UTM zone"),
+            format!("{degrees:.1} degrees"),
+            "choose --crs EPSG:N, or --crs source",
+        ));
+    }
+    let (a, b) = crs.proj4.as_deref().map_or(projection::ellipsoid(""), projection::ellipsoid);
+    if (a - projection::ellipsoid("").0).abs() > 10_000.0 {
+        let proj4 = format!("+proj=tmerc +lat_0=0 +lon_0={lon} +k=1 +x_0=0 +y_0=0 +a={a} +b={b} +no_defs");
+        return Ok(SourceCrs::new(format!("transverse Mercator at {lon}"), Some(proj4), false));
+    }
+    let zone = whole(((lon + 180.0) / 6.0).floor()).unwrap_or(0).min(59) + 1;
+    let code = match (polar, lat >= 0.0) {
+        (true, true) => 32661,
+        (true, false) => 32761,
+        (false, true) => 32600 + zone,
+        (false, false) => 32700 + zone,
+    };
+    known_crs(file, code)
+}
+
+/// The source's own lattice. Degrees become metres at the centre's latitude.
+fn as_it_is(mosaic: &Mosaic, place: &Place) -> Grid {
+    let crs = place.crs.as_ref().map(|crs| Crs {
+        name: crs.name.clone(),
+        proj4: crs.proj4.clone(),
+        origin: place.origin,
+        step: place.step,
+    });
+    let (origin, cell) = match &place.crs {
+        Some(source) if source.geographic => {
+            let (a, b) = projection::ellipsoid(source.proj4.as_deref().unwrap_or_default());
+            let lat = (place.origin[1] + place.step[1] * f64::from(mosaic.height - 1) / 2.0).to_radians();
+            // Radii of curvature: n along the parallel's normal, m along the meridian.
+            let e2 = 1.0 - (b / a) * (b / a);
+            let w2 = 1.0 - e2 * lat.sin() * lat.sin();
+            let (n, m) = (a / w2.sqrt(), a * (1.0 - e2) / (w2 * w2.sqrt()));
+            let [dx, dy] = place.step.map(f64::to_radians);
+            ([0.0; 2], [n * lat.cos().abs() * dx, m * dy])
+        }
+        Some(source) => {
+            (place.origin.map(|v| v * source.metres_per_unit), place.step.map(|v| v * source.metres_per_unit))
+        }
+        None => (place.origin, place.step),
+    };
+    grid(mosaic, origin, cell, crs)
+}
+
+fn resampled(
+    mosaic: &Mosaic,
+    place: &Place,
+    target: &SourceCrs,
+    cell: Option<f64>,
+) -> Result<(Grid, Option<Reprojection>)> {
+    let plan = Reprojection::new(mosaic, place, target, cell)?;
+    let crs = Crs {
+        name: target.name.clone(),
+        proj4: target.proj4.clone(),
+        origin: plan.origin,
+        step: [plan.step; 2],
+    };
+    let origin = plan.origin.map(|v| v * target.metres_per_unit);
+    let own = grid(mosaic, origin, [plan.step * target.metres_per_unit; 2], Some(crs));
+    let grid = Grid { width: plan.width, height: plan.height, resampled: true, ..own };
+    Ok((grid, Some(plan)))
+}
+
+fn grid(mosaic: &Mosaic, origin: [f64; 2], cell: [f64; 2], crs: Option<Crs>) -> Grid {
+    let first = mosaic.first();
+    Grid {
+        width: mosaic.width,
+        height: mosaic.height,
+        origin,
+        cell,
+        crs,
+        integer: mosaic.integer(),
+        height_scale: first.height_scale,
+        height_offset: first.height_offset,
+        resampled: false,
+    }
+}
+
+/// A whole number from 0 to `u32::MAX`, or `None`.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the range is checked")]
+fn whole(value: f64) -> Option<u32> {
+    (value.fract() == 0.0 && (0.0..=f64::from(u32::MAX)).contains(&value)).then_some(value as u32)
+}

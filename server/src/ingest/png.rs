@@ -1,0 +1,75 @@
+//! Greyscale PNG of 8 or 16 bits: heights without a place. Cells come from `--cell`.
+//!
+//! PNG cannot be read by position, so rows are transcribed once to a temporary file. Memory: one row.
+
+use std::fs::File;
+use std::io::{BufReader, BufWriter, Write};
+use std::path::Path;
+
+use ::png::{BitDepth, ColorType, Decoder, Limits};
+
+use super::error::{Result, broken, io_error, unsupported};
+use super::raster::{Dtype, Raster, SIDE_MAX, Samples};
+use super::samples::{Order, SampleFile};
+
+/// What the decoder may allocate: a few rows of the widest picture.
+const DECODER_BYTES_MAX: usize = 256 << 20;
+
+pub(super) fn open(path: &Path, file: File) -> Result<Raster> {
+    let failed = |e: ::png::DecodingError| {
+        broken(path, "a whole PNG", e.to_string(), "the file is damaged: fetch it again")
+    };
+    let limits = Limits { bytes: DECODER_BYTES_MAX };
+    let mut reader = Decoder::new_with_limits(BufReader::new(file), limits).read_info().map_err(failed)?;
+    let info = reader.info();
+    let (width, height) = (info.width, info.height);
+    if width > SIDE_MAX || height > SIDE_MAX {
+        let found = format!("{width} x {height}");
+        return Err(broken(
+            path,
+            format!("at most {SIDE_MAX} samples a side"),
+            found,
+            "fetch the file again",
+        ));
+    }
+    let dtype = match (info.color_type, info.bit_depth, info.interlaced) {
+        (ColorType::Grayscale, BitDepth::Eight, false) => Dtype::U8,
+        (ColorType::Grayscale, BitDepth::Sixteen, false) => Dtype::U16,
+        (ColorType::Grayscale, depth, interlaced) => {
+            return Err(unsupported(
+                path,
+                "8 or 16 bits a sample, not interlaced",
+                format!("{depth:?} bits, {}", if interlaced { "interlaced" } else { "not interlaced" }),
+                "save it again as 16-bit greyscale without interlacing",
+            ));
+        }
+        (colour, ..) => {
+            return Err(unsupported(
+                path,
+                "a greyscale picture of heights",
+                format!("{colour:?}: imagery"),
+                "give it as a texture layer, or save its heights as 16-bit greyscale",
+            ));
+        }
+    };
+    let file = tempfile::tempfile().map_err(io_error(path, "create a temporary file"))?;
+    let mut writer = BufWriter::with_capacity(1 << 18, file);
+    while let Some(row) = reader.next_row().map_err(failed)? {
+        writer.write_all(row.data()).map_err(io_error(path, "write a temporary file"))?;
+    }
+    let file = writer.into_inner().map_err(|e| io_error(path, "write a temporary file")(e.into_error()))?;
+    let samples = SampleFile { file, dtype, big_endian: true, order: Order::RowsFromNorth, width, height };
+    samples.check_length(path)?;
+    Ok(Raster {
+        file: path.to_owned(),
+        width,
+        height,
+        place: None,
+        dtype,
+        integer: true,
+        height_scale: 1.0,
+        height_offset: 0.0,
+        nodata: None,
+        samples: Samples::File(samples),
+    })
+}

@@ -1,0 +1,798 @@
+//! Claims about ingest: small files made in code, then every real DEM at hand.
+
+use std::collections::HashMap;
+use std::fs;
+use std::io::{Cursor, Write};
+use std::path::{Path, PathBuf};
+
+use tempfile::TempDir;
+use tiff::encoder::{Compression, DeflateLevel, Predictor, TiffEncoder, colortype};
+use tiff::tags::Tag;
+
+use super::*;
+
+fn source_crs() -> Options {
+    Options { crs: CrsChoice::Source, ..Options::default() }
+}
+
+fn folder() -> TempDir {
+    tempfile::tempdir().unwrap()
+}
+
+fn put(folder: &TempDir, name: &str, bytes: &[u8]) -> PathBuf {
+    let path = folder.path().join(name);
+    fs::write(&path, bytes).unwrap();
+    path
+}
+
+fn whole_grid(source: &Source) -> Vec<f64> {
+    let mut out = Vec::new();
+    source.read(0, 0, source.grid().width, source.grid().height, &mut out).unwrap();
+    out
+}
+
+/// Where a small TIFF lies and how it is packed.
+#[derive(Clone)]
+struct Tags {
+    origin: [f64; 2],
+    step: f64,
+    keys: Vec<u16>,
+    nodata: Option<&'static str>,
+    compression: Compression,
+    predictor: Predictor,
+    rows_per_strip: u32,
+}
+
+impl Tags {
+    fn new(keys: &[[u16; 4]]) -> Self {
+        let header = [1, 1, 0, u16::try_from(keys.len()).unwrap()];
+        Self {
+            origin: [500_000.0, 5_000_000.0],
+            step: 30.0,
+            keys: header.into_iter().chain(keys.iter().flatten().copied()).collect(),
+            nodata: None,
+            compression: Compression::Uncompressed,
+            predictor: Predictor::None,
+            rows_per_strip: 3,
+        }
+    }
+
+    fn utm() -> Self {
+        Self::new(&[[1024, 0, 1, 1], [1025, 0, 1, 1], [3072, 0, 1, 32632]])
+    }
+
+    fn degrees(origin: [f64; 2], step: f64) -> Self {
+        let keys = [[1024, 0, 1, 2], [1025, 0, 1, 2], [2048, 0, 1, 4326]];
+        Self { origin, step, ..Self::new(&keys) }
+    }
+}
+
+/// A TIFF of the colour type $colour, whose samples run from the north-west.
+macro_rules! tiff {
+    ($colour:ty, $width:expr, $height:expr, $samples:expr, $tags:expr) => {{
+        let mut bytes = Cursor::new(Vec::new());
+        let tags: &Tags = $tags;
+        let encoder = TiffEncoder::new(&mut bytes).unwrap();
+        let mut encoder = encoder.with_compression(tags.compression).with_predictor(tags.predictor);
+        let mut image = encoder.new_image::<$colour>($width, $height).unwrap();
+        image.rows_per_strip(tags.rows_per_strip).unwrap();
+        let directory = image.encoder();
+        directory.write_tag(Tag::ModelPixelScaleTag, &[tags.step, tags.step, 0.0][..]).unwrap();
+        let tie = [0.0, 0.0, 0.0, tags.origin[0], tags.origin[1], 0.0];
+        directory.write_tag(Tag::ModelTiepointTag, &tie[..]).unwrap();
+        directory.write_tag(Tag::GeoKeyDirectoryTag, &tags.keys[..]).unwrap();
+        if let Some(nodata) = tags.nodata {
+            directory.write_tag(Tag::GdalNodata, nodata).unwrap();
+        }
+        image.write_data(&$samples[..]).unwrap();
+        bytes.into_inner()
+    }};
+}
+
+/// A little-endian TIFF by hand, one tile or strip list, for what the encoder cannot write.
+fn raw_tiff(entries: &[(u16, u16, u32, u32)], data: &[u8]) -> Vec<u8> {
+    let mut bytes = b"II*\0\x08\0\0\0".to_vec();
+    bytes.extend(u16::try_from(entries.len()).unwrap().to_le_bytes());
+    for (tag, kind, count, value) in entries {
+        bytes.extend(tag.to_le_bytes());
+        bytes.extend(kind.to_le_bytes());
+        bytes.extend(count.to_le_bytes());
+        bytes.extend(value.to_le_bytes());
+    }
+    bytes.extend([0; 4]);
+    bytes.extend(data);
+    bytes
+}
+
+fn pattern(i: usize) -> i16 {
+    i16::try_from((i * 7919) % 3001).unwrap() - 1500
+}
+
+#[test]
+fn every_encoding_of_the_same_samples_reads_the_same() {
+    let folder = folder();
+    let (w, h) = (23, 17);
+    let samples: Vec<i16> = (0..w as usize * h as usize).map(pattern).collect();
+    let expected: Vec<f64> =
+        (0..h as usize).rev().flat_map(|y| samples[y * 23..][..23].iter().map(|v| f64::from(*v))).collect();
+    let deflate = Compression::Deflate(DeflateLevel::Fast);
+    for compression in [Compression::Uncompressed, deflate, Compression::Lzw, Compression::Packbits] {
+        for predictor in [Predictor::None, Predictor::Horizontal] {
+            for rows_per_strip in [1, 5, 17] {
+                let tags = Tags { compression, predictor, rows_per_strip, ..Tags::utm() };
+                let bytes = tiff!(colortype::GrayI16, w, h, samples, &tags);
+                let path = put(&folder, "a.tif", &bytes);
+                let source = open(&[path], &Options::default()).unwrap();
+                assert_eq!(whole_grid(&source), expected, "{predictor:?} {rows_per_strip}");
+                assert!(source.grid().integer && !source.grid().resampled);
+            }
+        }
+    }
+}
+
+#[test]
+fn every_sample_type_keeps_its_values() {
+    let folder = folder();
+    let check = |bytes: Vec<u8>, expected: &[f64], integer: bool| {
+        let source = open(&[put(&folder, "a.tif", &bytes)], &Options::default()).unwrap();
+        assert_eq!(whole_grid(&source), expected);
+        assert_eq!(source.grid().integer, integer);
+    };
+    let tags = Tags { compression: Compression::Deflate(DeflateLevel::Fast), ..Tags::utm() };
+    check(tiff!(colortype::Gray8, 2, 1, [0u8, 255], &tags), &[0.0, 255.0], true);
+    check(tiff!(colortype::Gray16, 2, 1, [0u16, 65535], &tags), &[0.0, 65535.0], true);
+    check(tiff!(colortype::Gray32, 2, 1, [0u32, u32::MAX], &tags), &[0.0, 4_294_967_295.0], true);
+    check(tiff!(colortype::GrayI32, 2, 1, [i32::MIN, 7], &tags), &[-2_147_483_648.0, 7.0], true);
+    check(tiff!(colortype::Gray32Float, 2, 1, [0.1f32, -3.5], &tags), &[f64::from(0.1f32), -3.5], false);
+    check(tiff!(colortype::Gray64Float, 2, 1, [0.1f64, -3.5], &tags), &[0.1, -3.5], false);
+}
+
+#[test]
+fn windows_are_cut_from_the_whole() {
+    let folder = folder();
+    let (w, h) = (150usize, 140usize);
+    let samples: Vec<i16> = (0..w * h).map(pattern).collect();
+    let tags = Tags {
+        compression: Compression::Lzw,
+        nodata: Some("-1500"),
+        rows_per_strip: 7,
+        ..Tags::degrees([8.0, 47.0], 1.0 / 1200.0)
+    };
+    let path = put(&folder, "a.tif", &tiff!(colortype::GrayI16, 150, 140, samples, &tags));
+    for options in [source_crs(), Options::default(), Options { cell: Some(2500.0), ..Options::default() }] {
+        let source = open(std::slice::from_ref(&path), &options).unwrap();
+        let all = whole_grid(&source);
+        let (gw, gh) = (source.grid().width, source.grid().height);
+        let mut out = Vec::new();
+        for (x0, y0, width, height) in [(0, 0, gw, 1), (gw - 1, 0, 1, gh), (gw / 3, gh / 3, gw / 2, gh / 2)] {
+            source.read(x0, y0, width, height, &mut out).unwrap();
+            let rows = (y0..y0 + height).map(|y| y as usize * gw as usize + x0 as usize);
+            let expected: Vec<f64> = rows.flat_map(|at| all[at..at + width as usize].to_vec()).collect();
+            let bits = |v: &[f64]| v.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
+            assert_eq!(bits(&out), bits(&expected), "{options:?}");
+        }
+        assert!(source.read(gw, 0, 1, 1, &mut out).is_err());
+        assert!(source.read(u32::MAX, 0, 2, 1, &mut out).is_err());
+        source.read(gw, gh, 0, 0, &mut out).unwrap();
+        assert!(out.is_empty());
+    }
+}
+
+#[test]
+fn threads_read_the_same_as_one() {
+    let folder = folder();
+    let samples: Vec<i16> = (0..256 * 256).map(pattern).collect();
+    let tags = Tags { compression: Compression::Lzw, rows_per_strip: 4, ..Tags::utm() };
+    let path = put(&folder, "a.tif", &tiff!(colortype::GrayI16, 256, 256, samples, &tags));
+    let source = open(&[path], &Options::default()).unwrap();
+    let all = whole_grid(&open(&[folder.path().join("a.tif")], &Options::default()).unwrap());
+    std::thread::scope(|scope| {
+        for _ in 0..8 {
+            scope.spawn(|| assert_eq!(whole_grid(&source), all));
+        }
+    });
+}
+
+#[test]
+fn an_area_sample_lies_half_a_cell_inside_its_corner() {
+    let folder = folder();
+    let at = |kind: u16| {
+        let tags = Tags::new(&[[1024, 0, 1, 1], [1025, 0, 1, kind], [3072, 0, 1, 32632]]);
+        let path = put(&folder, "a.tif", &tiff!(colortype::GrayI16, 4, 3, [0i16; 12], &tags));
+        open(&[path], &Options::default()).unwrap().grid().clone()
+    };
+    assert_eq!(at(1).origin, [500_015.0, 5_000_000.0 - 75.0]);
+    assert_eq!(at(2).origin, [500_000.0, 5_000_000.0 - 60.0]);
+    assert_eq!(at(2).cell, [30.0, 30.0]);
+    assert_eq!(at(2).crs.unwrap().name, "EPSG:32632");
+}
+
+#[test]
+fn feet_become_metres() {
+    let folder = folder();
+    // EPSG:2227 is California zone 3 in US survey feet; heights in international feet by key 4099.
+    let tags = Tags::new(&[[1024, 0, 1, 1], [1025, 0, 1, 2], [3072, 0, 1, 2227], [4099, 0, 1, 9002]]);
+    let path = put(&folder, "a.tif", &tiff!(colortype::GrayI16, 4, 3, [100i16; 12], &tags));
+    let source = open(&[path], &Options::default()).unwrap();
+    let grid = source.grid();
+    assert!((grid.cell[0] - 30.0 * 1200.0 / 3937.0).abs() < 1e-9);
+    assert!((grid.origin[0] - 500_000.0 * 1200.0 / 3937.0).abs() < 1e-6);
+    assert_eq!(grid.crs.as_ref().unwrap().step, [30.0, 30.0]);
+    assert!((grid.height_scale - 0.3048).abs() < 1e-12);
+}
+
+#[test]
+fn a_tiled_tiff_by_hand_reads_in_order() {
+    let folder = folder();
+    // Tags: size 20 x 18, 8 bits, two by two tiles of 16 x 16.
+    let tile = |seed: u8| (0..256u32).map(move |i| seed.wrapping_add(u8::try_from(i % 16).unwrap()));
+    let data: Vec<u8> = [0, 50, 100, 150].into_iter().flat_map(tile).collect();
+    let directory = 8 + 2 + 12 * 10 + 4;
+    let lists: Vec<u8> =
+        (0..4u32).map(|i| directory + 32 + i * 256).chain([256; 4]).flat_map(u32::to_le_bytes).collect();
+    let entries = [
+        (256, 4, 1, 20),
+        (257, 4, 1, 18),
+        (258, 3, 1, 8),
+        (259, 3, 1, 1),
+        (262, 3, 1, 1),
+        (277, 3, 1, 1),
+        (322, 3, 1, 16),
+        (323, 3, 1, 16),
+        (324, 4, 4, directory),
+        (325, 4, 4, directory + 16),
+    ];
+    let bytes = raw_tiff(&entries, &[lists, data].concat());
+    let path = put(&folder, "a.tif", &bytes);
+    assert!(
+        open(std::slice::from_ref(&path), &Options::default()).unwrap_err().to_string().contains("--cell")
+    );
+    let source = open(&[path], &Options { cell: Some(2.0), ..Options::default() }).unwrap();
+    let all = whole_grid(&source);
+    // The north-west sample is the first of tile 0; south-east is in tile 3.
+    assert_eq!((all[17 * 20], all[17 * 20 + 19], all[0], all[19]), (0.0, 53.0, 100.0, 153.0));
+    assert_eq!(source.grid().cell, [2.0, 2.0]);
+}
+
+/// Entries of a one-strip TIFF of 32-bit floats, `length` bytes right behind the directory.
+fn float_strip(
+    width: u32,
+    height: u32,
+    compression: u32,
+    predictor: u32,
+    length: u32,
+) -> Vec<(u16, u16, u32, u32)> {
+    vec![
+        (256, 4, 1, width),
+        (257, 4, 1, height),
+        (258, 3, 1, 32),
+        (259, 3, 1, compression),
+        (262, 3, 1, 1),
+        (273, 4, 1, 8 + 2 + 12 * 10 + 4),
+        (277, 3, 1, 1),
+        (279, 4, 1, length),
+        (317, 3, 1, predictor),
+        (339, 3, 1, 3),
+    ]
+}
+
+#[test]
+fn zstd_and_the_float_predictor_unpack() {
+    let folder = folder();
+    let values = [[1.5f32, -2.25, 1e-3, 7e5], [0.0, 3.5, -8.125, 4e8]];
+    // Predictor 3: the bytes of a row sorted by significance, the highest first, then differences.
+    let row = |row: [f32; 4]| {
+        let mut bytes: Vec<u8> = (0..4).flat_map(|k| row.map(|v| v.to_be_bytes()[k])).collect();
+        (1..bytes.len()).rev().for_each(|i| bytes[i] = bytes[i].wrapping_sub(bytes[i - 1]));
+        bytes
+    };
+    let plain: Vec<u8> = values.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
+    for (predictor, bytes) in [(1, plain), (3, values.into_iter().flat_map(row).collect())] {
+        let packed = zstd::encode_all(&bytes[..], 3).unwrap();
+        let length = u32::try_from(packed.len()).unwrap();
+        let path = put(&folder, "a.tif", &raw_tiff(&float_strip(4, 2, 50000, predictor, length), &packed));
+        let source = open(&[path], &Options { cell: Some(1.0), ..Options::default() }).unwrap();
+        let expected: Vec<f64> = values.iter().rev().flatten().map(|v| f64::from(*v)).collect();
+        assert_eq!(whole_grid(&source), expected, "predictor {predictor}");
+    }
+}
+
+#[test]
+fn big_tiff_and_big_endian_read_the_same() {
+    let folder = folder();
+    let samples: Vec<u16> = (0..30).map(|i| i * 2000).collect();
+    let mut big = Cursor::new(Vec::new());
+    TiffEncoder::new_big(&mut big).unwrap().write_image::<colortype::Gray16>(6, 5, &samples).unwrap();
+    let short = |tag: u16, value: u16| [tag, 3, 0, 1, value, 0].map(u16::to_be_bytes).concat();
+    let mut motorola = b"MM\0*\0\0\0\x08\0\x07".to_vec();
+    for (tag, value) in [(256, 6), (257, 5), (258, 16), (262, 1), (273, 98), (277, 1), (279, 60)] {
+        motorola.extend(short(tag, value));
+    }
+    motorola.extend([0; 4]);
+    motorola.extend(samples.iter().flat_map(|v| v.to_be_bytes()));
+    let expected: Vec<f64> = samples.chunks(6).rev().flatten().map(|v| f64::from(*v)).collect();
+    for bytes in [big.into_inner(), motorola] {
+        let options = Options { cell: Some(1.0), ..Options::default() };
+        assert_eq!(whole_grid(&open(&[put(&folder, "a.tif", &bytes)], &options).unwrap()), expected);
+    }
+}
+
+#[test]
+fn nodata_becomes_nan_and_can_be_overridden() {
+    let folder = folder();
+    let tags = Tags { nodata: Some("-9999"), ..Tags::utm() };
+    let samples = [1.0f32, -9999.0, f32::NAN, f32::INFINITY];
+    let path = put(&folder, "a.tif", &tiff!(colortype::Gray32Float, 4, 1, samples, &tags));
+    let valid = |options: &Options| {
+        let out = whole_grid(&open(std::slice::from_ref(&path), options).unwrap());
+        out.iter().map(|v| !v.is_nan()).collect::<Vec<_>>()
+    };
+    assert_eq!(valid(&Options::default()), [true, false, false, false]);
+    let options = Options { nodata: Some(1.0), ..Options::default() };
+    assert_eq!(valid(&options), [false, true, false, false]);
+}
+
+#[test]
+fn a_mosaic_joins_exactly() {
+    let folder = folder();
+    let (w, h) = (40usize, 30usize);
+    let value = |x: usize, y: usize| pattern(y * w + x);
+    let crop = |name: &str, x0: usize, y0: usize, cw: usize, ch: usize, hole: bool| {
+        let samples: Vec<i16> = (y0..y0 + ch)
+            .flat_map(|y| {
+                (x0..x0 + cw).map(move |x| if hole && x == x0 + cw - 1 { -32768 } else { value(x, y) })
+            })
+            .collect();
+        let origin = [500_000.0 + 30.0 * x0 as f64, 5_000_000.0 - 30.0 * y0 as f64];
+        let tags = Tags { origin, nodata: Some("-32768"), ..Tags::utm() };
+        let (cw, ch) = (u32::try_from(cw).unwrap(), u32::try_from(ch).unwrap());
+        put(&folder, name, &tiff!(colortype::GrayI16, cw, ch, samples, &tags))
+    };
+    let whole = crop("whole.tif", 0, 0, w, h, false);
+    // Four tiles share a rim; the rim column of one is nodata and must come from its neighbour.
+    let tiles = [
+        crop("a.tif", 0, 0, 21, 16, true),
+        crop("b.tif", 20, 0, 20, 16, false),
+        crop("c.tif", 0, 15, 21, 15, false),
+        crop("d.tif", 20, 15, 20, 15, false),
+    ];
+    let whole = open(&[whole], &Options::default()).unwrap();
+    for order in [[0, 1, 2, 3], [3, 1, 0, 2]] {
+        let paths: Vec<PathBuf> = order.iter().map(|i| tiles[*i].clone()).collect();
+        let source = open(&paths, &Options::default()).unwrap();
+        assert_eq!(source.grid(), whole.grid());
+        assert_eq!(whole_grid(&source), whole_grid(&whole));
+    }
+}
+
+#[test]
+fn a_reprojected_plane_stays_a_plane() {
+    let folder = folder();
+    // Values are the longitude itself, so bilinear interpolation is exact and what remains is the map's error.
+    for (lon, lat) in [(8.0, 47.0), (-70.5, -44.0), (179.9, 10.0), (15.0, 78.0)] {
+        let (n, step) = (241u32, 1.0 / 1200.0);
+        let samples: Vec<f64> = (0..n * n).map(|i| lon + f64::from(i % n) * step).collect();
+        let tags = Tags { compression: Compression::Lzw, ..Tags::degrees([lon, lat], step) };
+        let path = put(&folder, "a.tif", &tiff!(colortype::Gray64Float, n, n, samples, &tags));
+        let source = open(&[path], &Options::default()).unwrap();
+        let grid = source.grid().clone();
+        let crs = grid.crs.clone().unwrap();
+        let projection = crate::projection::Projection::new(&crs.proj4.unwrap()).unwrap();
+        let all = whole_grid(&source);
+        let mut valid = 0;
+        for (i, value) in all.iter().enumerate().filter(|(_, v)| !v.is_nan()) {
+            let (x, y) = (i % grid.width as usize, i / grid.width as usize);
+            let at = |axis: usize, k: usize| crs.origin[axis] + k as f64 * crs.step[axis];
+            let (exact, _) = projection.inverse(at(0, x), at(1, y)).unwrap();
+            let error = (value - exact + 180.0).rem_euclid(360.0) - 180.0;
+            assert!(error.abs() < 0.01 * step, "{value} {exact} at {x} {y}");
+            valid += 1;
+        }
+        // A rotated square fills most of its bounding box, and nothing valid is lost.
+        assert!(valid * 10 > all.len() * 6, "{valid} of {}", all.len());
+        assert!(grid.resampled && (grid.cell[0] - grid.cell[1]).abs() < 1e-9);
+    }
+}
+
+#[test]
+fn resampling_keeps_nodata_out_of_its_neighbours() {
+    let folder = folder();
+    let n = 101u32;
+    let samples: Vec<i16> = (0..n * n).map(|i| if i == 50 * n + 50 { -32768 } else { 100 }).collect();
+    let tags = Tags { nodata: Some("-32768"), ..Tags::degrees([8.0, 47.0], 1.0 / 1200.0) };
+    let path = put(&folder, "a.tif", &tiff!(colortype::GrayI16, n, n, samples, &tags));
+    let source = open(&[path], &Options::default()).unwrap();
+    let all = whole_grid(&source);
+    assert!(all.iter().all(|v| v.is_nan() || (v - 100.0).abs() < 1e-9));
+    let (w, h) = (source.grid().width as usize, source.grid().height as usize);
+    let inner = |i: &usize| (w / 4..w * 3 / 4).contains(&(i % w)) && (h / 4..h * 3 / 4).contains(&(i / w));
+    let holes = (0..all.len()).filter(inner).filter(|i| all[*i].is_nan()).count();
+    assert!((1..=9).contains(&holes), "{holes}");
+}
+
+#[test]
+fn the_same_crs_is_not_resampled() {
+    let folder = folder();
+    let path = put(&folder, "a.tif", &tiff!(colortype::GrayI16, 9, 9, [5i16; 81], &Tags::utm()));
+    let options = Options { crs: CrsChoice::Epsg(32632), ..Options::default() };
+    assert!(!open(std::slice::from_ref(&path), &options).unwrap().grid().resampled);
+    let options = Options { crs: CrsChoice::Epsg(32632), cell: Some(10.0), ..Options::default() };
+    let source = open(&[path], &options).unwrap();
+    assert_eq!(source.grid().cell, [10.0, 10.0]);
+    assert!(source.grid().resampled);
+    assert!(whole_grid(&source).iter().filter(|v| !v.is_nan()).all(|v| *v == 5.0));
+}
+
+fn png_bytes(colour: ::png::ColorType, depth: ::png::BitDepth, side: u32, data: &[u8]) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    let mut encoder = ::png::Encoder::new(&mut bytes, side, side);
+    encoder.set_color(colour);
+    encoder.set_depth(depth);
+    let mut writer = encoder.write_header().unwrap();
+    writer.write_image_data(data).unwrap();
+    writer.finish().unwrap();
+    bytes
+}
+
+fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    encoder.write_all(bytes).unwrap();
+    encoder.finish().unwrap()
+}
+
+fn zip_of(files: &[(&str, &str)]) -> Vec<u8> {
+    let mut writer = zip::ZipWriter::new(Cursor::new(Vec::new()));
+    for (name, text) in files {
+        writer.start_file(*name, zip::write::SimpleFileOptions::default()).unwrap();
+        writer.write_all(text.as_bytes()).unwrap();
+    }
+    writer.finish().unwrap().into_inner()
+}
+
+const ASC: &str =
+    "NCOLS 3\nnrows 2\nxllcorner 10\nyllcenter 20\ndx 2\ndy 4\nNODATA_value -9\n1 2\n3 4 -9\n 6\r\n";
+
+#[test]
+fn other_formats_read_their_values() {
+    let folder = folder();
+    let nan = f64::NAN;
+    let check = |path: PathBuf, options: &Options, expected: &[f64]| {
+        let source = open(&[path], options).unwrap();
+        let text = |v: &[f64]| format!("{v:?}");
+        assert_eq!(text(&whole_grid(&source)), text(expected));
+        source.grid().clone()
+    };
+    for bytes in [ASC.into(), zip_of(&[("a.prj", ""), ("b/c.ASC", ASC)]), gzip(ASC.as_bytes())] {
+        let grid = check(put(&folder, "a.bin", &bytes), &Options::default(), &[4.0, nan, 6.0, 1.0, 2.0, 3.0]);
+        assert_eq!((grid.origin, grid.cell, grid.integer), ([11.0, 20.0], [2.0, 4.0], true));
+    }
+    let hgt: Vec<u8> = [1i16, 2, -32768, 4].iter().flat_map(|v| v.to_be_bytes()).collect();
+    let check_hgt = |name: &str, bytes: &[u8]| {
+        let grid = check(put(&folder, name, bytes), &source_crs(), &[nan, 4.0, 1.0, 2.0]);
+        assert_eq!(grid.crs.unwrap().origin, [-66.0, -46.0]);
+    };
+    check_hgt("S46W066.hgt", &hgt);
+    check_hgt("s46w066.SRTMGL1.hgt.gz", &gzip(&hgt));
+    let png = png_bytes(::png::ColorType::Grayscale, ::png::BitDepth::Sixteen, 2, &[0, 1, 1, 0, 0, 3, 0, 4]);
+    let options = Options { cell: Some(160.0), height_scale: Some(0.1), ..Options::default() };
+    let grid = check(put(&folder, "a.png", &png), &options, &[3.0, 4.0, 1.0, 256.0]);
+    assert_eq!((grid.cell, grid.height_scale, grid.origin), ([160.0; 2], 0.1, [0.0; 2]));
+    let raw: Vec<u8> = [1.5f32, 2.0, 3.0, 4.0].iter().flat_map(|v| v.to_le_bytes()).collect();
+    let raw_options =
+        Options { cell: Some(1.0), raw: Some("2x2:f32".parse().unwrap()), ..Options::default() };
+    check(put(&folder, "a.raw", &raw), &raw_options, &[3.0, 4.0, 1.5, 2.0]);
+}
+
+/// A USGS DEM of two columns, the second one sample shorter and higher.
+fn usgs() -> Vec<u8> {
+    let mut a = vec![b' '; 1024];
+    let mut field = |at: usize, text: &str| a[at..at + text.len()].copy_from_slice(text.as_bytes());
+    field(144, "     1     1     1    10");
+    field(528, "     2     2     4");
+    field(816, "0.300000E+020.300000E+020.100000E+01     1     2");
+    let column = |x: &str, y: &str, heights: &[&str]| {
+        let zero = "   0.000000000000000D+00";
+        let counts = format!("     1     1{:6}     1", heights.len());
+        let text = format!("{counts}{x:>24}{y:>24}{zero}{zero}{zero}{}", heights.concat());
+        format!("{text:<1024}").into_bytes()
+    };
+    let b = column("0.5D+06", "0.51D+07", &["   100", "   101", "-32767"]);
+    let c = column("0.50003D+06", "5100030.0", &["   202", "   203"]);
+    [a, b, c].concat()
+}
+
+#[test]
+fn a_usgs_dem_is_padded_where_its_columns_are_ragged() {
+    let folder = folder();
+    let source = open(&[put(&folder, "a.dem", &usgs())], &Options::default()).unwrap();
+    let nan = f64::NAN;
+    assert_eq!(format!("{:?}", whole_grid(&source)), format!("{:?}", [100.0, nan, 101.0, 202.0, nan, 203.0]));
+    assert_eq!(source.grid().crs.as_ref().unwrap().name, "EPSG:26710");
+    assert_eq!(source.grid().origin, [500_000.0, 5_100_000.0]);
+    assert!(source.grid().integer);
+}
+
+/// One row of the table: what is wrong, the file's name and bytes, options, words the message must have.
+type Case = (&'static str, &'static str, Vec<u8>, Options, &'static [&'static str]);
+
+fn cases() -> Vec<Case> {
+    let plain = Options::default;
+    let epsg = |code| Options { crs: CrsChoice::Epsg(code), ..Options::default() };
+    let small = tiff!(colortype::GrayI16, 8, 8, [1i16; 64], &Tags::utm());
+    let packed = Tags { compression: Compression::Lzw, ..Tags::utm() };
+    let packed = tiff!(colortype::GrayI16, 8, 8, [1i16; 64], &packed);
+    let bad_nodata = Tags { nodata: Some("none"), ..Tags::utm() };
+    let bad_nodata = tiff!(colortype::GrayI16, 8, 8, [1i16; 64], &bad_nodata);
+    let colour = tiff!(colortype::RGB8, 2, 2, [1u8; 12], &Tags::utm());
+    let absurd = |tiled: bool| {
+        let kind = if tiled { (324, 325) } else { (273, 279) };
+        let size = [(256, 4, 1, 4_000_000_000), (257, 4, 1, 4_000_000_000), (258, 3, 1, 16)];
+        let rest = [(262, 3, 1, 1), (kind.0, 4, 1, 8), (kind.1, 4, 1, 8), (322, 4, 1, 16), (323, 4, 1, 16)];
+        raw_tiff(&[&size[..], &rest[..]].concat(), &[])
+    };
+    let big = [(256, 4, 1, 16_000_000), (257, 4, 1, 16_000_000), (258, 3, 1, 16), (262, 3, 1, 1)];
+    let listed = [(273, 4, 1, 8), (279, 4, 1, 8)];
+    let one_strip = raw_tiff(&[&big[..], &listed[..], &[(259, 3, 1, 5)]].concat(), &[]);
+    let many = raw_tiff(&[&big[..], &[(273, 4, u32::MAX, 8)]].concat(), &[]);
+    let side = [(256, 4, 1, 16), (257, 4, 1, 16), (258, 3, 1, 8), (262, 3, 1, 1)];
+    let cut = raw_tiff(&[&side[..], &[(273, 4, 1, 122), (279, 4, 1, 256)]].concat(), &[0; 136]);
+    let hgt = vec![0; 1200];
+    let grey = png_bytes(::png::ColorType::Grayscale, ::png::BitDepth::Eight, 2, &[1; 4]);
+    let rgb = png_bytes(::png::ColorType::Rgb, ::png::BitDepth::Eight, 2, &[1; 12]);
+    let text = |t: &str| t.as_bytes().to_vec();
+    let cut_usgs = usgs()[..1100].to_vec();
+    vec![
+        ("truncated", "a.tif", small[..small.len() - 40].to_vec(), plain(), &["directory"]),
+        ("cut samples", "a.tif", cut, plain(), &["256 bytes", "a file of 222 bytes", "fetch it again"]),
+        ("truncated, packed", "a.tif", packed[..40].to_vec(), plain(), &["inside the file"]),
+        ("cut in the header", "a.tif", small[..9].to_vec(), plain(), &["directory"]),
+        ("absurd strips", "a.tif", absurd(false), plain(), &["4000000000", "16777216"]),
+        ("absurd tiles", "a.tif", absurd(true), plain(), &["4000000000", "16777216"]),
+        ("one huge strip", "a.tif", one_strip, plain(), &["strips or tiles"]),
+        ("a list beyond the file", "a.tif", many, plain(), &["inside the file", "273"]),
+        ("colour TIFF", "a.tif", colour, plain(), &["3 bands", "texture"]),
+        ("empty", "a.tif", Vec::new(), plain(), &["an empty file"]),
+        ("no DEM", "a.txt", text("Dear reader,\n"), plain(), &["dear reader", "GeoTIFF"]),
+        ("binary", "a.bin", vec![0, 1, 2, 3], plain(), &["00, 01, 02, 03"]),
+        ("colour PNG", "a.png", rgb, plain(), &["imagery", "greyscale"]),
+        ("PNG without --cell", "a.png", grey.clone(), plain(), &["--cell METRES"]),
+        ("PNG cut", "a.png", grey[..50].to_vec(), plain(), &["a whole PNG"]),
+        (
+            "nodata out of range",
+            "a.tif",
+            small.clone(),
+            Options { nodata: Some(-99_999.0), ..plain() },
+            &["i16", "-99999", "--nodata"],
+        ),
+        ("nodata NaN", "a.tif", small.clone(), Options { nodata: Some(f64::NAN), ..plain() }, &["NaN"]),
+        ("nodata unreadable", "a.tif", bad_nodata, plain(), &["'none'", "--nodata"]),
+        ("no CRS", "a.asc", text(ASC), epsg(32632), &["EPSG:32632", "none in the file"]),
+        ("no CRS, no place", "a.png", grey, epsg(32632), &["EPSG:32632", "none in the file"]),
+        ("unknown EPSG", "a.tif", small.clone(), epsg(99_999), &["EPSG:99999", "known"]),
+        ("geographic EPSG", "a.tif", small.clone(), epsg(4326), &["degree"]),
+        ("useless cell", "a.tif", small.clone(), Options { cell: Some(5.0), ..plain() }, &["--cell"]),
+        ("cell 0", "a.tif", small.clone(), Options { cell: Some(0.0), ..plain() }, &["--cell above 0"]),
+        ("oblong .hgt", "N00E000.hgt", hgt, plain(), &["a square", "1200 bytes"]),
+        ("nameless .hgt", "alps.hgt", vec![0; 8], plain(), &["N46E008", "alps.hgt"]),
+        ("few values", "a.asc", text(&ASC.replace(" 6", "")), plain(), &["6 values", "5 values"]),
+        ("many values", "a.asc", text(&format!("{ASC} 7")), plain(), &["6 values", "more"]),
+        ("words", "a.asc", text(&ASC.replace(" 6", " x")), plain(), &["numbers", "'x'"]),
+        ("no size", "a.asc", text("ncols 3\ncellsize 1\n1"), plain(), &["'nrows'"]),
+        ("absurd .asc", "a.asc", text("ncols 4e9\n"), plain(), &["sizes from 1", "ncols"]),
+        ("long word", "a.asc", text(&format!("ncols {}", "1".repeat(99))), plain(), &["at most 64"]),
+        ("no grid in zip", "a.zip", zip_of(&[("a.txt", "x")]), plain(), &["exactly one .asc", "0 among 1"]),
+        ("two grids", "a.zip", zip_of(&[("a.asc", ASC), ("b.asc", ASC)]), plain(), &["2 among 2"]),
+        ("broken zip", "a.zip", b"PK\x03\x04xxxxxxx".to_vec(), plain(), &["zip"]),
+        ("broken gzip", "a.asc.gz", gzip(ASC.as_bytes())[..30].to_vec(), plain(), &["a whole gzip"]),
+        ("cut USGS", "a.dem", cut_usgs, plain(), &["2 columns"]),
+        (
+            "raw of another size",
+            "a.raw",
+            vec![0; 10],
+            Options { raw: Some("2x2:i16".parse().unwrap()), cell: Some(1.0), ..plain() },
+            &["8 bytes", "10 bytes"],
+        ),
+    ]
+}
+
+#[test]
+fn errors_name_file_expected_found_and_remedy() {
+    let folder = folder();
+    for (what, name, bytes, options, words) in cases() {
+        let path = put(&folder, name, &bytes);
+        let message = match open(&[path], &options) {
+            Err(e) => e.to_string(),
+            Ok(source) => panic!("{what}: opened as {:?}", source.grid()),
+        };
+        for word in words.iter().chain(&[name, "expected ", ", found ", ": "]) {
+            assert!(message.contains(word), "{what}: no '{word}' in: {message}");
+        }
+    }
+    let refused = |paths: &[PathBuf]| open(paths, &Options::default()).unwrap_err().to_string();
+    assert!(refused(&[folder.path().to_owned()]).contains("a directory"));
+    assert!(refused(&[folder.path().join("nowhere.tif")]).contains("nowhere.tif"));
+    assert!(refused(&[]).contains("at least one"));
+}
+
+#[test]
+fn a_rotated_transform_is_refused() {
+    let folder = folder();
+    let mut bytes = Cursor::new(Vec::new());
+    let mut encoder = TiffEncoder::new(&mut bytes).unwrap();
+    let mut image = encoder.new_image::<colortype::Gray8>(2, 2).unwrap();
+    let mut matrix = [0.0; 16];
+    matrix[..8].copy_from_slice(&[30.0, 5.0, 0.0, 1e5, 5.0, -30.0, 0.0, 1e6]);
+    image.encoder().write_tag(Tag::ModelTransformationTag, &matrix[..]).unwrap();
+    image.write_data(&[1u8; 4]).unwrap();
+    let path = put(&folder, "a.tif", &bytes.into_inner());
+    let message = open(&[path], &Options::default()).unwrap_err().to_string();
+    assert!(message.contains("rotated") && message.contains("gdalwarp"), "{message}");
+}
+
+#[test]
+fn files_off_the_grid_are_refused_by_both_names() {
+    let folder = folder();
+    let first = put(&folder, "first.tif", &tiff!(colortype::GrayI16, 4, 4, [1i16; 16], &Tags::utm()));
+    let other = |tags: &Tags| {
+        let second = put(&folder, "second.tif", &tiff!(colortype::GrayI16, 4, 4, [1i16; 16], tags));
+        open(&[first.clone(), second], &Options::default()).unwrap_err().to_string()
+    };
+    let cell = other(&Tags { step: 31.0, ..Tags::utm() });
+    let offset = other(&Tags { origin: [500_010.0, 5_000_000.0], ..Tags::utm() });
+    let crs = other(&Tags::new(&[[1024, 0, 1, 1], [3072, 0, 1, 32633]]));
+    let far = other(&Tags { origin: [500_000.0 + 30e8, 5_000_000.0], ..Tags::utm() });
+    let wanted = ["cells of 30 x 30", "0.333", "EPSG:32633", "samples a side"];
+    for (message, word) in [cell, offset, crs, far].iter().zip(wanted) {
+        for word in [word, "first.tif", "second.tif"] {
+            assert!(message.contains(word), "no '{word}' in: {message}");
+        }
+    }
+}
+
+/// Bytes changed anywhere give an error or values, never a panic.
+#[test]
+fn damaged_files_do_not_panic() {
+    let folder = folder();
+    let samples: Vec<i16> = (0..32 * 32).map(pattern).collect();
+    let packed = Tags { compression: Compression::Deflate(DeflateLevel::Fast), ..Tags::utm() };
+    let lzw = Tags { compression: Compression::Lzw, predictor: Predictor::Horizontal, ..Tags::utm() };
+    let files = [
+        ("a.tif", tiff!(colortype::GrayI16, 32, 32, samples, &Tags::utm())),
+        ("a.tif", tiff!(colortype::GrayI16, 32, 32, samples, &packed)),
+        ("a.tif", tiff!(colortype::GrayI16, 32, 32, samples, &lzw)),
+        ("a.dem", usgs()),
+        ("a.asc", ASC.as_bytes().to_vec()),
+        ("a.zip", zip_of(&[("a.asc", ASC)])),
+    ];
+    let mut random = 0x2545_f491_4f6c_dd1d_u64;
+    let mut next = |below: usize| {
+        random ^= random << 13;
+        random ^= random >> 7;
+        random ^= random << 17;
+        usize::try_from(random % below as u64).unwrap()
+    };
+    for (name, bytes) in files {
+        for round in 0..600 {
+            let mut bytes = bytes.clone();
+            for _ in 0..=next(3) {
+                // Half the changes hit the ends, where headers and directories lie.
+                let at = if round % 2 == 0 {
+                    next(bytes.len())
+                } else {
+                    bytes.len() - 1 - next(bytes.len().min(400))
+                };
+                bytes[at] = u8::try_from(next(256)).unwrap();
+            }
+            let path = put(&folder, name, &bytes);
+            for options in [Options::default(), source_crs()] {
+                if let Ok(source) = open(std::slice::from_ref(&path), &options) {
+                    let (w, h) = (source.grid().width.min(64), source.grid().height.min(64));
+                    let _ = source.read(0, 0, w, h, &mut Vec::new());
+                }
+            }
+        }
+    }
+}
+
+fn real_data() -> Option<PathBuf> {
+    let beside = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
+    let folder = std::env::var_os("DIAMANTINA_DATA").map_or(beside, PathBuf::from);
+    let found = folder.join("MANIFEST.tsv").is_file();
+    if !found {
+        eprintln!("SKIPPED: no real DEMs at {} (set DIAMANTINA_DATA)", folder.display());
+    }
+    found.then_some(folder)
+}
+
+#[test]
+fn every_real_dem_is_as_its_manifest_says() {
+    let Some(folder) = real_data() else { return };
+    let manifest = fs::read_to_string(folder.join("MANIFEST.tsv")).unwrap();
+    let names: Vec<&str> = manifest.lines().next().unwrap().split('\t').collect();
+    for line in manifest.lines().skip(1) {
+        let row: HashMap<&str, &str> = names.iter().copied().zip(line.split('\t')).collect();
+        let file = row["file"];
+        if file.contains("gcanyon_color") || file.contains("Benchmark_2_input") {
+            continue;
+        }
+        let cell = file.ends_with(".png").then_some(1.0);
+        let source = open(&[folder.join(file)], &Options { cell, ..source_crs() });
+        let source = source.unwrap_or_else(|e| panic!("{e}"));
+        let grid = source.grid();
+        assert_eq!(row["cols"], grid.width.to_string(), "{file}");
+        assert_eq!(row["rows"], grid.height.to_string(), "{file}");
+        let (mut low, mut high, mut valid, mut out) = (f64::INFINITY, f64::NEG_INFINITY, 0u64, Vec::new());
+        for y in (0..grid.height).step_by(512) {
+            source.read(0, y, grid.width, 512.min(grid.height - y), &mut out).unwrap();
+            for v in out.iter().filter(|v| !v.is_nan()) {
+                (low, high, valid) = (low.min(*v), high.max(*v), valid + 1);
+            }
+        }
+        let share = valid as f64 / (f64::from(grid.width) * f64::from(grid.height));
+        let expected: f64 = row["valid_share"].parse().unwrap();
+        assert!((share - expected).abs() < 6e-4, "{file}: valid {share}, manifest {expected}");
+        for (found, name) in [(low, "min"), (high, "max")] {
+            if let Ok(expected) = row[name].parse::<f64>() {
+                let tolerance = 1e-5 * expected.abs().max(0.01);
+                assert!((found - expected).abs() <= tolerance, "{file}: {name} {found}, manifest {expected}");
+            }
+        }
+        if row["crs"].starts_with("EPSG:") {
+            assert_eq!(grid.crs.as_ref().unwrap().name, row["crs"], "{file}");
+        }
+        let integer = row["dtype"].contains("int");
+        assert!(grid.integer == integer || file.ends_with(".asc"), "{file}: integer {}", grid.integer);
+    }
+}
+
+/// `--crs auto` on every real DEM: degrees are resampled, and lose nothing but their rims.
+#[test]
+fn every_real_dem_has_a_frame_in_metres() {
+    let Some(folder) = real_data() else { return };
+    for file in ["osgearth_terrain/mt_rainier_90m.tif", "okushiri/OK24.tif", "srtm3_nh/N44W072.hgt.gz"] {
+        let path = [folder.join(file)];
+        let source = open(&path, &source_crs()).unwrap();
+        let projected = open(&path, &Options::default()).unwrap();
+        assert!(
+            projected.grid().resampled && projected.grid().crs.as_ref().unwrap().name.starts_with("EPSG:326")
+        );
+        let mean = |source: &Source| {
+            let all = whole_grid(source);
+            let valid: Vec<f64> = all.into_iter().filter(|v| !v.is_nan()).collect();
+            valid.iter().sum::<f64>() / valid.len() as f64
+        };
+        let (a, b) = (mean(&source), mean(&projected));
+        // The mean over degrees weights the poleward rows a little more.
+        assert!((a - b).abs() < 0.02 * a.abs(), "{file}: {a} {b}");
+        let cell = projected.grid().cell[0];
+        let natural = (source.grid().cell[0] * source.grid().cell[1]).sqrt();
+        assert!((cell / natural - 1.0).abs() < 2e-3, "{file}: {cell} {natural}");
+    }
+}
+
+/// `cargo test --release -p diamantina-server reads_fast -- --ignored --nocapture` prints the speeds.
+#[test]
+#[ignore = "a measurement"]
+fn reads_fast() {
+    let Some(folder) = real_data() else { return };
+    let moon = Options { crs: CrsChoice::Source, ..Options::default() };
+    for (file, options) in [
+        ("moon/moon_sw_8193.tif", &moon),
+        ("osgearth_terrain/mt_rainier_90m.tif", &moon),
+        ("osgearth_terrain/mt_rainier_90m.tif", &Options::default()),
+        ("srtm3_geotiff/N46E008.tif", &Options::default()),
+    ] {
+        let source = open(&[folder.join(file)], options).unwrap();
+        let (grid, mut out) = (source.grid(), Vec::new());
+        for pass in 0..2 {
+            let start = std::time::Instant::now();
+            for y in (0..grid.height).step_by(512) {
+                for x in (0..grid.width).step_by(512) {
+                    source.read(x, y, 512.min(grid.width - x), 512.min(grid.height - y), &mut out).unwrap();
+                }
+            }
+            let speed = f64::from(grid.width) * f64::from(grid.height) / start.elapsed().as_secs_f64() / 1e6;
+            eprintln!("{file} {}: pass {pass}: {speed:.1} Msamples/s", options.crs);
+        }
+    }
+}

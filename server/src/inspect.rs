@@ -1,0 +1,286 @@
+//! What a store holds: levels, bytes, errors; and, on request, whether every blob is intact.
+
+use crate::store::{Key, Kind, Store, StoreError};
+use diamantina_protocol::bintree::Forest;
+use diamantina_protocol::diamond::{Block, Diamond};
+use diamantina_protocol::index::{self, Entry, PageError};
+use diamantina_protocol::message::{Layer, Scene};
+use diamantina_protocol::points::{self, DecodeError, Tally};
+use rayon::prelude::*;
+use serde::Serialize;
+use std::collections::HashMap;
+
+/// Why a store could not be inspected, or what is wrong with it.
+#[derive(Debug, thiserror::Error)]
+pub enum InspectError {
+    /// The store cannot be read.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// A page of the index is not there.
+    #[error("layer {layer}: index page {page} is missing; build the store again")]
+    NoPage {
+        /// The layer.
+        layer: String,
+        /// The page.
+        page: u32,
+    },
+    /// A page of the index cannot be read.
+    #[error("layer {layer}: {error}")]
+    Page {
+        /// The layer.
+        layer: String,
+        /// Why not.
+        error: PageError,
+    },
+    /// A page cannot be decompressed.
+    #[error("layer {layer}: index page {page} is no zstd frame ({error}); build the store again")]
+    Compression {
+        /// The layer.
+        layer: String,
+        /// The page.
+        page: u32,
+        /// What the decompressor said.
+        error: std::io::Error,
+    },
+    /// A payload is not there.
+    #[error("layer {layer}: the points of diamond {centre:?} are missing; build the store again")]
+    NoPoints {
+        /// The layer.
+        layer: String,
+        /// The diamond.
+        centre: [u32; 2],
+    },
+    /// A payload is not what the index says.
+    #[error("layer {layer}: the points of diamond {centre:?} have {found} bytes, the index says {expected}; build the store again")]
+    Size {
+        /// The layer.
+        layer: String,
+        /// The diamond.
+        centre: [u32; 2],
+        /// Bytes found.
+        found: u32,
+        /// Bytes expected.
+        expected: u32,
+    },
+    /// A payload cannot be decoded.
+    #[error("layer {layer}: the points of diamond {centre:?}: {error}")]
+    Points {
+        /// The layer.
+        layer: String,
+        /// The diamond.
+        centre: [u32; 2],
+        /// Why not.
+        error: DecodeError,
+    },
+    /// Something is in the store that nobody asks for.
+    #[error("layer {layer}: {count} blobs belong to no diamond; build the store again")]
+    Strays {
+        /// The layer.
+        layer: String,
+        /// How many.
+        count: usize,
+    },
+}
+
+/// A store in numbers.
+#[derive(Debug, Serialize)]
+pub struct Inspection {
+    /// The scene.
+    pub scene: Scene,
+    /// Its layers.
+    pub layers: Vec<LayerInspection>,
+    /// Whether every blob was read, checked and decoded.
+    pub verified: bool,
+}
+
+/// A layer in numbers.
+#[derive(Debug, Serialize)]
+pub struct LayerInspection {
+    /// The layer's name.
+    pub name: String,
+    /// Samples of the source with a height.
+    pub valid_samples: u64,
+    /// Bytes of all points.
+    pub point_bytes: u64,
+    /// Bytes of the index.
+    pub index_bytes: u64,
+    /// Bits of points a sample with a height.
+    pub bits_per_sample: f64,
+    /// By level of diamonds.
+    pub levels: Vec<LevelInspection>,
+    /// The largest error, in metres, where every diamond is split.
+    pub finest_error: f32,
+    /// How errors were found.
+    pub errors: String,
+    /// New points by kind, if the blobs were verified.
+    pub real_points: Option<u64>,
+    /// See `real_points`.
+    pub fictitious_points: Option<u64>,
+}
+
+/// The diamonds of a level in numbers.
+#[derive(Debug, Default, Serialize)]
+pub struct LevelInspection {
+    /// The level.
+    pub level: u32,
+    /// Diamonds with some height below them.
+    pub diamonds: u64,
+    /// Bytes of their points.
+    pub bytes: u64,
+    /// Steps, in metres: of most points that the level adds.
+    pub step: f64,
+    /// The least declared error, in metres.
+    pub error_min: f32,
+    /// The largest declared error, in metres.
+    pub error_max: f32,
+}
+
+/// All entries of a layer's index.
+///
+/// # Errors
+/// When a page is missing or damaged.
+pub fn entries(store: &Store, number: u8, layer: &Layer) -> Result<HashMap<Diamond, Entry>, InspectError> {
+    let mut all = HashMap::new();
+    for page in 0..index::pages(&layer.forest) {
+        all.extend(read_page(store, number, layer, page)?);
+    }
+    Ok(all)
+}
+
+/// One page of a layer's index.
+///
+/// # Errors
+/// When it is missing or damaged.
+pub fn read_page(store: &Store, number: u8, layer: &Layer, page: u32) -> Result<Vec<(Diamond, Entry)>, InspectError> {
+    let name = || layer.name.clone();
+    let key = Key { layer: number, kind: Kind::Index, a: page, b: 0 };
+    let blob = store.get(key)?.ok_or_else(|| InspectError::NoPage { layer: name(), page })?;
+    let bytes = zstd::bulk::decompress(&blob, 4 * index::PAGE_BYTES_MAX)
+        .map_err(|error| InspectError::Compression { layer: name(), page, error })?;
+    index::decode(&layer.forest, page, &bytes).map_err(|error| InspectError::Page { layer: name(), error })
+}
+
+/// Reads the index of a store and, with `verify`, every blob: checksums, sizes, and that each payload
+/// decodes from its ancestors.
+///
+/// # Errors
+/// At the first thing that is wrong.
+pub fn inspect(store: &Store, verify: bool) -> Result<Inspection, InspectError> {
+    let mut layers = Vec::new();
+    for (number, layer) in store.scene().layers.iter().enumerate() {
+        let number = u8::try_from(number).unwrap_or(u8::MAX);
+        let entries = entries(store, number, layer)?;
+        let mut index_bytes = 0;
+        let mut strays = 0;
+        for (key, bytes) in store.keys().filter(|(key, _)| key.layer == number) {
+            match key.kind {
+                Kind::Index => index_bytes += u64::from(bytes),
+                Kind::Points => {
+                    let known = layer.forest.diamond([key.a, key.b]).and_then(|d| entries.get(&d));
+                    match known {
+                        Some(e) if e.bytes == bytes => {}
+                        Some(e) => {
+                            let (layer, centre) = (layer.name.clone(), [key.a, key.b]);
+                            return Err(InspectError::Size { layer, centre, found: bytes, expected: e.bytes });
+                        }
+                        None => strays += 1,
+                    }
+                }
+            }
+        }
+        if strays > 0 {
+            return Err(InspectError::Strays { layer: layer.name.clone(), count: strays });
+        }
+        let tally = if verify { Some(verify_layer(store, number, layer, &entries)?) } else { None };
+        layers.push(summary(layer, &entries, index_bytes, tally));
+    }
+    Ok(Inspection { scene: store.scene().clone(), layers, verified: verify })
+}
+
+fn summary(layer: &Layer, entries: &HashMap<Diamond, Entry>, index_bytes: u64, tally: Option<(u64, u64)>) -> LayerInspection {
+    let mut levels: Vec<LevelInspection> = (0..layer.forest.levels())
+        .map(|level| LevelInspection {
+            level,
+            error_min: f32::MAX,
+            step: f64::from(layer.coding.level_step(level)) * layer.quantum,
+            ..LevelInspection::default()
+        })
+        .collect();
+    for (d, e) in entries.iter().filter(|(_, e)| !e.is_empty()) {
+        let level = &mut levels[d.level() as usize];
+        level.diamonds += 1;
+        level.bytes += u64::from(e.bytes);
+        level.error_min = level.error_min.min(e.error_metres);
+        level.error_max = level.error_max.max(e.error_metres);
+    }
+    for level in levels.iter_mut().filter(|l| l.diamonds == 0) {
+        level.error_min = 0.0;
+    }
+    let point_bytes = levels.iter().map(|l| l.bytes).sum();
+    LayerInspection {
+        name: layer.name.clone(),
+        valid_samples: layer.valid_samples,
+        point_bytes,
+        index_bytes,
+        bits_per_sample: point_bytes as f64 * 8.0 / layer.valid_samples as f64,
+        levels,
+        finest_error: layer.finest_error,
+        errors: layer.errors.clone(),
+        real_points: tally.map(|t| t.0),
+        fictitious_points: tally.map(|t| t.1),
+    }
+}
+
+/// Decodes every diamond of a layer, level by level; the real and the fictitious points.
+fn verify_layer(store: &Store, number: u8, layer: &Layer, entries: &HashMap<Diamond, Entry>) -> Result<(u64, u64), InspectError> {
+    let (mut real, mut fictitious) = (0, 0);
+    decode_levels(store, number, layer, entries, |_, blocks| {
+        for (_, _, tally) in blocks {
+            real += u64::from(tally.real);
+            fictitious += u64::from(tally.fictitious);
+        }
+    })?;
+    Ok((real, fictitious))
+}
+
+/// Decodes a layer level by level and shows each level's blocks to `visit`, coarse to fine.
+///
+/// Memory: two levels of blocks, about 24 bytes a sample of the finest.
+///
+/// # Errors
+/// When a payload is missing or damaged.
+pub fn decode_levels(
+    store: &Store,
+    number: u8,
+    layer: &Layer,
+    entries: &HashMap<Diamond, Entry>,
+    mut visit: impl FnMut(u32, &[(Diamond, Block, Tally)]),
+) -> Result<(), InspectError> {
+    let forest: &Forest = &layer.forest;
+    let mut before: HashMap<Diamond, Block> = HashMap::new();
+    for level in 0..forest.levels() {
+        let filled: Vec<Diamond> = forest.diamonds(level).filter(|d| entries.get(d).is_some_and(|e| !e.is_empty())).collect();
+        let blocks: Vec<(Diamond, Block, Tally)> = filled
+            .into_par_iter()
+            .map(|d| {
+                let mut block = Block::empty(forest);
+                for parent in forest.parents(d) {
+                    if let Some(from) = before.get(&parent) {
+                        block.inherit(forest, d, parent, from);
+                    }
+                }
+                let [a, b] = d.centre();
+                let payload = store.get(Key { layer: number, kind: Kind::Points, a, b })?;
+                if payload.is_none() && entries.get(&d).is_some_and(|e| e.bytes > 0) {
+                    return Err(InspectError::NoPoints { layer: layer.name.clone(), centre: [a, b] });
+                }
+                let tally = points::decode(forest, &layer.coding, d, &mut block, &payload.unwrap_or_default())
+                    .map_err(|error| InspectError::Points { layer: layer.name.clone(), centre: [a, b], error })?;
+                Ok((d, block, tally))
+            })
+            .collect::<Result<_, InspectError>>()?;
+        visit(level, &blocks);
+        before = blocks.into_iter().map(|(d, block, _)| (d, block)).collect();
+    }
+    Ok(())
+}

@@ -1,0 +1,308 @@
+//! The command line of the server.
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use diamantina_protocol::message::{Kind, is_name};
+use diamantina_protocol::points::Rule;
+use diamantina_server::hierarchy::{self, Report};
+use diamantina_server::inspect::{self, Inspection};
+use diamantina_server::progress::Progress;
+use diamantina_server::store::Store;
+use diamantina_server::{demo, http, ingest};
+use std::io::Write;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+/// Builds and serves streamed terrain.
+#[derive(Parser)]
+#[command(version, about, propagate_version = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Turn DEM files into a store of diamonds
+    Build(BuildArgs),
+    /// Offer stores over HTTP
+    Serve(ServeArgs),
+    /// Say what a store holds
+    Inspect(InspectArgs),
+    /// Build a sample scene, serve it and render a picture of it
+    Demo(DemoArgs),
+    /// Ask a running server whether it is well (for container health checks)
+    Health(HealthArgs),
+}
+
+#[derive(Args)]
+struct BuildArgs {
+    /// DEM files of one layer: GeoTIFF, .hgt, Arc ASCII, USGS DEM, PNG, raw; .gz and .zip of these
+    #[arg(required = true, value_name = "DEM")]
+    sources: Vec<PathBuf>,
+    /// The folder of the store; an older scene in it is replaced once the new one is complete
+    #[arg(short, long, value_name = "STORE")]
+    output: PathBuf,
+    /// The largest error at the finest level, in metres; 0 is lossless (floats: to the quantum)
+    #[arg(long, default_value_t = 0.0, value_name = "METRES")]
+    max_error: f64,
+    /// The most memory to use
+    #[arg(long, default_value = "2GiB", value_name = "BYTES", value_parser = parse_bytes)]
+    memory: u64,
+    /// Threads [default: one a core]
+    #[arg(long, value_name = "N")]
+    threads: Option<usize>,
+    /// Encodings to build
+    #[arg(long, default_value = "points", value_enum, value_delimiter = ',')]
+    encoding: Vec<Encoding>,
+    /// How the receiver deduces the height of a fictitious point
+    #[arg(long, default_value = "smooth", value_enum)]
+    rule: RuleName,
+    /// Metres of the unit in which heights are stored [default: the source's own unit, or found from it]
+    #[arg(long, value_name = "METRES")]
+    quantum: Option<f64>,
+    /// Segments along each side of a patch
+    #[arg(long, default_value = "64", value_name = "N", value_parser = ["32", "64", "128"])]
+    patch_segments: String,
+    /// The scene's name in addresses [default: the name of the store's folder]
+    #[arg(long, value_name = "NAME")]
+    scene: Option<String>,
+    #[command(flatten)]
+    ingest: ingest::Options,
+    /// Print the report as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Encoding {
+    Points,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum RuleName {
+    Midpoint,
+    Smooth,
+}
+
+#[derive(Args)]
+struct ServeArgs {
+    /// Folders of stores
+    #[arg(required = true, value_name = "STORE")]
+    stores: Vec<PathBuf>,
+    /// The address to listen on; port 0 picks a free one
+    #[arg(long, default_value = "127.0.0.1:8080", value_name = "ADDRESS:PORT")]
+    listen: SocketAddr,
+}
+
+#[derive(Args)]
+struct InspectArgs {
+    /// The folder of the store
+    store: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+    /// Read, check and decode every blob
+    #[arg(long)]
+    verify: bool,
+}
+
+#[derive(Args)]
+struct DemoArgs {
+    /// The folder for the sample DEM, its store and the picture
+    #[arg(long, default_value = "demo", value_name = "FOLDER")]
+    folder: PathBuf,
+    /// Samples along each side of the sample DEM
+    #[arg(long, default_value_t = 2049, value_name = "N", value_parser = clap::value_parser!(u32).range(257..=16385))]
+    samples: u32,
+    /// The address to listen on
+    #[arg(long, default_value = "127.0.0.1:8080", value_name = "ADDRESS:PORT")]
+    listen: SocketAddr,
+    /// End after the picture [also: HEADLESS=1]
+    #[arg(long)]
+    headless: bool,
+}
+
+#[derive(Args)]
+struct HealthArgs {
+    /// The server's address
+    #[arg(default_value = "127.0.0.1:8080", value_name = "ADDRESS:PORT")]
+    address: SocketAddr,
+}
+
+/// Bytes with an optional unit: 512MiB, 2GiB, 1500000000.
+fn parse_bytes(text: &str) -> Result<u64, String> {
+    let digits = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
+    let (number, unit) = text.split_at(digits);
+    let scale = match unit.trim() {
+        "" | "B" => 1u64,
+        "KiB" | "K" => 1 << 10,
+        "MiB" | "M" => 1 << 20,
+        "GiB" | "G" => 1 << 30,
+        "kB" => 1000,
+        "MB" => 1_000_000,
+        "GB" => 1_000_000_000,
+        _ => return Err(format!("unit '{unit}': expected KiB, MiB, GiB, kB, MB or GB, as in 2GiB")),
+    };
+    let value: u64 = number.parse().map_err(|_| "expected a whole number with a unit, as in 2GiB".to_owned())?;
+    value.checked_mul(scale).ok_or_else(|| "more than 16 EiB".to_owned())
+}
+
+/// A failure with its exit code: 1 failed, 2 wrong use.
+struct Failure(u8, String);
+
+impl<E: std::error::Error> From<E> for Failure {
+    fn from(error: E) -> Self {
+        Self(1, error.to_string())
+    }
+}
+
+fn main() -> ExitCode {
+    let filter = tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| "warn".into());
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    let result = match Cli::parse().command {
+        Command::Build(args) => build(args),
+        Command::Serve(args) => serve(&args.stores, args.listen),
+        Command::Inspect(args) => inspect_store(&args),
+        Command::Demo(args) => demonstrate(&args),
+        Command::Health(args) => http::ask_health(args.address).map_err(|e| Failure(1, e)),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(Failure(code, message)) => {
+            // Nothing is left to do if standard error is closed.
+            let _ = writeln!(std::io::stderr(), "error: {message}");
+            ExitCode::from(code)
+        }
+    }
+}
+
+/// The scene's name: the one given, or the store's own folder, made fit for an address.
+fn scene_name(given: Option<String>, store: &Path) -> Result<String, Failure> {
+    if let Some(name) = given {
+        return if is_name(&name) {
+            Ok(name)
+        } else {
+            Err(Failure(2, format!("--scene '{name}': expected 1 to 64 letters, digits, '-', '_' or '.', not starting with '.'")))
+        };
+    }
+    let folder = store.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    let fit: String = folder.chars().map(|c| if c.is_ascii_alphanumeric() || "._-".contains(c) { c } else { '-' }).take(64).collect();
+    let fit = fit.trim_start_matches('.').to_owned();
+    Ok(if fit.is_empty() { "scene".to_owned() } else { fit })
+}
+
+fn build(args: BuildArgs) -> Result<(), Failure> {
+    if let Some(threads) = args.threads {
+        rayon::ThreadPoolBuilder::new().num_threads(threads).build_global()?;
+    }
+    let options = hierarchy::Options {
+        scene: scene_name(args.scene, &args.output)?,
+        layer: "terrain".to_owned(),
+        kind: Kind::Terrain,
+        max_error: args.max_error,
+        rule: match args.rule {
+            RuleName::Midpoint => Rule::Midpoint,
+            RuleName::Smooth => Rule::Smooth,
+        },
+        quantum: args.quantum,
+        patch_log2: match args.patch_segments.as_str() {
+            "32" => 5,
+            "128" => 7,
+            _ => 6,
+        },
+        memory: args.memory,
+    };
+    let source = ingest::open(&args.sources, &args.ingest)?;
+    let report = hierarchy::build(&source, &args.output, &options, &Progress::new())?;
+    let mut out = std::io::stdout().lock();
+    if args.json {
+        writeln!(out, "{}", serde_json::to_string_pretty(&report)?)?;
+    } else {
+        print_report(&mut out, &args.output, &report)?;
+    }
+    Ok(())
+}
+
+fn print_report(out: &mut impl Write, store: &Path, report: &Report) -> std::io::Result<()> {
+    let layer = &report.scene.layers[0];
+    writeln!(out, "{}: scene '{}', version {}", store.display(), report.scene.name, report.scene.version)?;
+    writeln!(
+        out,
+        "  {} x {} samples of {:.3} x {:.3} m, heights {:.3} to {:.3} m, {:.1} % nodata",
+        layer.samples[0],
+        layer.samples[1],
+        layer.cell[0],
+        layer.cell[1],
+        layer.heights[0],
+        layer.heights[1],
+        100.0 * (1.0 - layer.valid_samples as f64 / report.samples as f64),
+    )?;
+    writeln!(
+        out,
+        "  {} diamonds, {} bytes of points ({:.3} bits a sample), {} bytes of index, finest error {} m",
+        report.diamonds, report.point_bytes, report.bits_per_sample, report.index_bytes, layer.finest_error,
+    )?;
+    writeln!(out, "  {:.1} s, {:.2} Msamples/s", report.seconds, report.msamples_per_second)?;
+    writeln!(out, "Next: diamantina-server serve {}", store.display())
+}
+
+fn serve(stores: &[PathBuf], listen: SocketAddr) -> Result<(), Failure> {
+    let server = http::Server::open(stores, listen)?;
+    let mut out = std::io::stdout().lock();
+    writeln!(out, "Serving {} at {}", server.scenes().join(", "), server.address())?;
+    out.flush()?;
+    drop(out);
+    Ok(server.run_until_signal()?)
+}
+
+fn inspect_store(args: &InspectArgs) -> Result<(), Failure> {
+    let store = Store::open(&args.store)?;
+    let inspection = inspect::inspect(&store, args.verify)?;
+    let mut out = std::io::stdout().lock();
+    if args.json {
+        writeln!(out, "{}", serde_json::to_string_pretty(&inspection)?)?;
+    } else {
+        print_inspection(&mut out, &inspection)?;
+    }
+    Ok(())
+}
+
+fn print_inspection(out: &mut impl Write, i: &Inspection) -> std::io::Result<()> {
+    let crs = i.scene.frame.crs.as_ref().map_or("unknown", |c| &c.name);
+    writeln!(out, "scene {}  version {}  CRS {crs}", i.scene.name, i.scene.version)?;
+    for (layer, about) in i.layers.iter().zip(&i.scene.layers) {
+        let [columns, rows] = about.forest.roots();
+        writeln!(
+            out,
+            "layer {}: {} x {} samples of {:.3} x {:.3} m, {columns} x {rows} roots, quantum {} m, errors {}",
+            layer.name, about.samples[0], about.samples[1], about.cell[0], about.cell[1], about.quantum, layer.errors
+        )?;
+        writeln!(out, "  level  diamonds        bytes     step [m]   error min [m]   error max [m]")?;
+        for l in &layer.levels {
+            writeln!(
+                out,
+                "  {:>5} {:>9} {:>12} {:>12} {:>15} {:>15}",
+                l.level, l.diamonds, l.bytes, l.step, l.error_min, l.error_max
+            )?;
+        }
+        writeln!(out, "  finest error {} m (asked: {} m)", layer.finest_error, about.max_error)?;
+        writeln!(
+            out,
+            "  {} bytes of points, {:.3} bits a sample; {} bytes of index",
+            layer.point_bytes, layer.bits_per_sample, layer.index_bytes
+        )?;
+        if let (Some(real), Some(fictitious)) = (layer.real_points, layer.fictitious_points) {
+            writeln!(out, "  {real} real points, {fictitious} fictitious")?;
+        }
+    }
+    if i.verified {
+        writeln!(out, "verified: every blob matches its checksum and decodes")?;
+    }
+    Ok(())
+}
+
+fn demonstrate(args: &DemoArgs) -> Result<(), Failure> {
+    let headless = args.headless || std::env::var("HEADLESS").is_ok_and(|v| !v.is_empty() && v != "0");
+    demo::run(&args.folder, args.samples, args.listen, headless).map_err(|e| Failure(1, e.to_string()))
+}

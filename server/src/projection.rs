@@ -1,0 +1,287 @@
+//! Map projections: longitude and latitude ⇄ the coordinates of a CRS.
+//!
+//! The formulas are proj4rs's; the definitions of EPSG codes are crs-definitions's. Two things are
+//! added: the equirectangular projection (`+proj=eqc`, the usual one for other planets), and a
+//! fall-back for datums that need shift grids. No grids are carried, so NAD27 is shifted with its mean
+//! three-parameter transformation for the conterminous states (about 10 m), and other grids are ignored.
+
+use proj4rs::Proj;
+use proj4rs::transform::transform;
+
+/// Mean shift from NAD27 to WGS 84 over the conterminous United States, metres (NIMA TR8350.2).
+const NAD27_SHIFT: &str = "+ellps=clrk66 +towgs84=-8,160,176";
+
+/// Why text is not a projection that this build can compute.
+#[derive(Debug, thiserror::Error)]
+pub enum ProjectionError {
+    /// The PROJ string is malformed or names a projection that is not built in.
+    #[error("expected a PROJ string with a known projection, found '{proj4}' ({reason}): choose another CRS")]
+    Definition {
+        /// The text as given.
+        proj4: String,
+        /// What the parser said.
+        reason: String,
+    },
+}
+
+/// The PROJ string of an EPSG code, for instance 32611; `None` if the code is not in the tables.
+#[must_use]
+pub fn epsg(code: u32) -> Option<&'static str> {
+    Some(crs_definitions::from_code(u16::try_from(code).ok()?)?.proj4)
+}
+
+/// One CRS, ready to convert to and from longitude and latitude. Immutable, a few hundred bytes.
+pub struct Projection {
+    kind: Kind,
+    lonlat: Proj,
+    metres_per_unit: f64,
+}
+
+enum Kind {
+    Proj(Box<Proj>),
+    Equirectangular(Equirectangular),
+}
+
+impl std::fmt::Debug for Projection {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let name = match &self.kind {
+            Kind::Proj(proj) => proj.projname(),
+            Kind::Equirectangular(_) => "eqc",
+        };
+        f.debug_struct("Projection").field("name", &name).finish_non_exhaustive()
+    }
+}
+
+impl Projection {
+    /// Reads a PROJ string such as `+proj=utm +zone=11 +datum=WGS84`. The text may be hostile.
+    ///
+    /// # Errors
+    /// When the string is malformed or its projection is not built in.
+    pub fn new(proj4: &str) -> Result<Self, ProjectionError> {
+        let failed = |reason: String| ProjectionError::Definition { proj4: proj4.to_owned(), reason };
+        let kind = if parameter(proj4, "proj") == Some("eqc") {
+            Kind::Equirectangular(Equirectangular::new(proj4).map_err(|e| failed(e.to_owned()))?)
+        } else {
+            let proj = Proj::from_proj_string(proj4)
+                .or_else(|_| Proj::from_proj_string(&without_grids(proj4)))
+                .map_err(|e| failed(e.to_string()))?;
+            Kind::Proj(Box::new(proj))
+        };
+        let lonlat =
+            Proj::from_proj_string("+proj=longlat +datum=WGS84").map_err(|e| failed(e.to_string()))?;
+        Ok(Self { kind, lonlat, metres_per_unit: unit_metres(proj4) })
+    }
+
+    /// Metres in one unit of x and y (1 for geographic CRSs, whose unit is the degree).
+    #[must_use]
+    pub fn metres_per_unit(&self) -> f64 {
+        self.metres_per_unit
+    }
+
+    /// True when x and y are degrees of longitude and latitude.
+    #[must_use]
+    pub fn is_geographic(&self) -> bool {
+        matches!(&self.kind, Kind::Proj(proj) if proj.is_latlong())
+    }
+
+    /// CRS coordinates (in the CRS's units) of a WGS 84 longitude and latitude in degrees; `None` outside
+    /// the projection's domain. About half a microsecond.
+    #[must_use]
+    pub fn forward(&self, lon_deg: f64, lat_deg: f64) -> Option<(f64, f64)> {
+        match &self.kind {
+            Kind::Proj(proj) => {
+                if proj.is_latlong() && !(-90.0..=90.0).contains(&lat_deg) {
+                    return None;
+                }
+                convert(&self.lonlat, proj, lon_deg, lat_deg)
+            }
+            Kind::Equirectangular(eqc) => eqc.forward(lon_deg, lat_deg),
+        }
+    }
+
+    /// WGS 84 longitude and latitude in degrees of CRS coordinates; `None` outside the projection's domain.
+    #[must_use]
+    pub fn inverse(&self, x: f64, y: f64) -> Option<(f64, f64)> {
+        match &self.kind {
+            Kind::Proj(proj) => convert(proj, &self.lonlat, x, y),
+            Kind::Equirectangular(eqc) => eqc.inverse(x, y),
+        }
+    }
+
+    /// Coordinates in `other` of the point (x, y) of this CRS, the datum shifted once, directly.
+    #[must_use]
+    pub fn to(&self, other: &Self, x: f64, y: f64) -> Option<(f64, f64)> {
+        match (&self.kind, &other.kind) {
+            (Kind::Proj(from), Kind::Proj(to)) => convert(from, to, x, y),
+            _ => {
+                let (lon, lat) = self.inverse(x, y)?;
+                other.forward(lon, lat)
+            }
+        }
+    }
+}
+
+/// Major and minor half axes of a PROJ string's ellipsoid, metres; WGS 84's when it names none.
+#[must_use]
+pub fn ellipsoid(proj4: &str) -> (f64, f64) {
+    // (name, a, inverse flattening), the ellipsoids that EPSG's geographic CRSs use most.
+    const KNOWN: [(&str, f64, f64); 9] = [
+        ("wgs84", 6_378_137.0, 298.257_223_563),
+        ("grs80", 6_378_137.0, 298.257_222_101),
+        ("nad83", 6_378_137.0, 298.257_222_101),
+        ("clrk66", 6_378_206.4, 294.978_698_2),
+        ("nad27", 6_378_206.4, 294.978_698_2),
+        ("bessel", 6_377_397.155, 299.152_812_8),
+        ("intl", 6_378_388.0, 297.0),
+        ("krass", 6_378_245.0, 298.3),
+        ("airy", 6_377_563.396, 299.324_964_6),
+    ];
+    let number = |key| parameter(proj4, key).and_then(|v| v.parse::<f64>().ok()).filter(|v| *v > 0.0);
+    if let Some(r) = number("R") {
+        return (r, r);
+    }
+    if let Some(a) = number("a") {
+        return (a, number("b").unwrap_or_else(|| number("rf").map_or(a, |rf| a - a / rf)));
+    }
+    let name = parameter(proj4, "ellps").or(parameter(proj4, "datum")).unwrap_or("wgs84").to_lowercase();
+    let (_, a, rf) = KNOWN.into_iter().find(|k| k.0 == name).unwrap_or(KNOWN[0]);
+    (a, a - a / rf)
+}
+
+/// The value of `+key=value` in a PROJ string.
+fn parameter<'a>(proj4: &'a str, key: &str) -> Option<&'a str> {
+    proj4.split_whitespace().find_map(|word| word.strip_prefix('+')?.strip_prefix(key)?.strip_prefix('='))
+}
+
+/// The same definition with nothing that needs a shift grid.
+fn without_grids(proj4: &str) -> String {
+    let words = proj4.split_whitespace().filter(|word| !word.starts_with("+nadgrids="));
+    words.map(|w| if w == "+datum=NAD27" { NAD27_SHIFT } else { w }).collect::<Vec<_>>().join(" ")
+}
+
+fn unit_metres(proj4: &str) -> f64 {
+    let given = parameter(proj4, "to_meter").and_then(|v| match v.split_once('/') {
+        Some((n, d)) => Some(n.parse::<f64>().ok()? / d.parse::<f64>().ok()?),
+        None => v.parse().ok(),
+    });
+    given.filter(|m: &f64| m.is_finite() && *m > 0.0).unwrap_or(match parameter(proj4, "units") {
+        Some("ft") => 0.3048,
+        Some("us-ft") => 1200.0 / 3937.0,
+        Some("km") => 1000.0,
+        Some("ind-ft") => 0.304_799_841_53,
+        _ => 1.0,
+    })
+}
+
+/// proj4rs with degrees outside and radians inside.
+fn convert(from: &Proj, to: &Proj, x: f64, y: f64) -> Option<(f64, f64)> {
+    let (x, y) = if from.is_latlong() { (x.to_radians(), y.to_radians()) } else { (x, y) };
+    let mut point = (x, y, 0.0);
+    transform(from, to, &mut point).ok()?;
+    let (x, y) =
+        if to.is_latlong() { (point.0.to_degrees(), point.1.to_degrees()) } else { (point.0, point.1) };
+    (x.is_finite() && y.is_finite()).then_some((x, y))
+}
+
+/// `+proj=eqc`: x is proportional to longitude and y to latitude, on a sphere.
+struct Equirectangular {
+    radius: f64,
+    lon_0: f64,
+    lat_0: f64,
+    cos_lat_ts: f64,
+    x_0: f64,
+    y_0: f64,
+    unit: f64,
+}
+
+impl Equirectangular {
+    fn new(proj4: &str) -> Result<Self, &'static str> {
+        let number = |key| match parameter(proj4, key).map(str::parse::<f64>) {
+            None => Ok(0.0),
+            Some(Ok(v)) if v.is_finite() => Ok(v),
+            Some(_) => Err("a parameter is not a number"),
+        };
+        let cos_lat_ts = number("lat_ts")?.to_radians().cos();
+        if cos_lat_ts < 1e-9 {
+            return Err("lat_ts is at a pole");
+        }
+        Ok(Self {
+            radius: ellipsoid(proj4).0,
+            lon_0: number("lon_0")?,
+            lat_0: number("lat_0")?,
+            cos_lat_ts,
+            x_0: number("x_0")?,
+            y_0: number("y_0")?,
+            unit: unit_metres(proj4),
+        })
+    }
+
+    fn forward(&self, lon: f64, lat: f64) -> Option<(f64, f64)> {
+        if !lon.is_finite() || !(-90.0..=90.0).contains(&lat) {
+            return None;
+        }
+        let lam = (lon - self.lon_0 + 180.0).rem_euclid(360.0) - 180.0;
+        let x = self.radius * self.cos_lat_ts * lam.to_radians() + self.x_0;
+        let y = self.radius * (lat - self.lat_0).to_radians() + self.y_0;
+        Some((x / self.unit, y / self.unit))
+    }
+
+    fn inverse(&self, x: f64, y: f64) -> Option<(f64, f64)> {
+        let lam = ((x * self.unit - self.x_0) / (self.radius * self.cos_lat_ts)).to_degrees();
+        let lat = ((y * self.unit - self.y_0) / self.radius).to_degrees() + self.lat_0;
+        // The seam at 180 degrees counts as both sides.
+        let inside = lam.abs() <= 180.0 + 1e-9 && lat.abs() <= 90.0 + 1e-9;
+        inside.then_some((lam + self.lon_0, lat.clamp(-90.0, 90.0)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn of(code: u32) -> Projection {
+        Projection::new(epsg(code).unwrap()).unwrap()
+    }
+
+    /// Reference values: EPSG Guidance Note 7-2 for the polar stereographic, PROJ for the others.
+    #[test]
+    fn known_points_agree() {
+        let close = |a: (f64, f64), b: (f64, f64), eps| {
+            assert!((a.0 - b.0).abs() < eps && (a.1 - b.1).abs() < eps, "{a:?} {b:?}");
+        };
+        // On the central meridian x is 500 km; the meridian arc to 45 degrees is 4984944.378 m.
+        close(of(32632).forward(9.0, 45.0).unwrap(), (500_000.0, 4_984_944.378 * 0.9996), 0.01);
+        close(of(3857).forward(180.0, 0.0).unwrap(), (20_037_508.342_789, 0.0), 0.001);
+        close(of(3857).forward(10.0, 60.0).unwrap(), (1_113_194.908, 8_399_737.890), 0.01);
+        // EPSG:3031 is variant B about the pole: the pole itself is the origin.
+        close(of(3031).forward(0.0, -90.0).unwrap(), (0.0, 0.0), 0.001);
+    }
+
+    #[test]
+    fn inverse_undoes_forward() {
+        let moon = Projection::new("+proj=eqc +lat_ts=30 +lon_0=10 +R=1737400").unwrap();
+        for projection in [of(32611), of(3857), of(2193), of(2227), of(4326), of(26710), of(25832), moon] {
+            for (lon, lat) in [(-119.5, 34.25), (12.0, 44.0), (172.0, -41.0)] {
+                let Some((x, y)) = projection.forward(lon, lat) else { continue };
+                let Some((lon2, lat2)) = projection.inverse(x, y) else { continue };
+                if (lon2 - lon).abs() < 90.0 && (x.abs() < 1e7) {
+                    assert!(
+                        (lon - lon2).abs() < 2e-5 && (lat - lat2).abs() < 2e-5,
+                        "{projection:?} {lon} {lat}"
+                    );
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn hostile_definitions_are_refused_or_harmless() {
+        for text in ["", "+proj=nonsense", "+proj=eqc +lat_ts=90", "+proj=eqc +lon_0=x", "+zone=3", "\u{0}"] {
+            assert!(Projection::new(text).is_err(), "{text}");
+        }
+        assert!(of(32611).forward(f64::NAN, 0.0).is_none());
+        assert!(of(4326).forward(0.0, 91.0).is_none());
+        assert_eq!(epsg(99_999), None);
+        assert_eq!(epsg(1), None);
+    }
+}
