@@ -1,15 +1,29 @@
 //! Map projections: longitude and latitude ⇄ the coordinates of a CRS.
 //!
-//! The formulas are proj4rs's; the definitions of EPSG codes are crs-definitions's. Two things are
-//! added: the equirectangular projection (`+proj=eqc`, the usual one for other planets), and a
-//! fall-back for datums that need shift grids. No grids are carried, so NAD27 is shifted with its mean
-//! three-parameter transformation for the conterminous states (about 10 m), and other grids are ignored.
+//! The formulas are proj4rs's, the definitions of EPSG codes crs-definitions's. Two things are added: the
+//! equirectangular projection (`+proj=eqc`, the usual one for other planets) and a detour around a slip in
+//! proj4rs's ellipsoids (see `REWRITTEN`). No shift grids are carried: NAD27 gets its mean shift (good to
+//! some 10 m), the grids of other datums are left out.
 
 use proj4rs::Proj;
 use proj4rs::transform::transform;
 
-/// Mean shift from NAD27 to WGS 84 over the conterminous United States, metres (NIMA TR8350.2).
-const NAD27_SHIFT: &str = "+ellps=clrk66 +towgs84=-8,160,176";
+/// Words that proj4rs 0.1.5 gets wrong, and what says the same rightly. It takes the flattening of an
+/// ellipsoid that is given by its minor half axis as (a - b) / b, which puts UTM on Clarke 1866 off by 85 m
+/// at 46 degrees north; so such ellipsoids are given by a and their inverse flattening. NAD27 gets its mean
+/// shift over the conterminous United States (NIMA TR8350.2).
+const REWRITTEN: [(&str, &str); 7] = [
+    ("+ellps=clrk66", "+a=6378206.4 +rf=294.9786982138982"),
+    ("+datum=NAD27", "+a=6378206.4 +rf=294.9786982138982 +towgs84=-8,160,176"),
+    ("+ellps=mod_airy", "+a=6377340.189 +rf=299.3249646"),
+    (
+        "+datum=ire65",
+        "+a=6377340.189 +rf=299.3249646 +towgs84=482.530,-130.596,564.557,-1.042,-0.214,-0.631,8.15",
+    ),
+    ("+ellps=new_intl", "+a=6378157.5 +rf=298.2496153900135"),
+    ("+ellps=plessis", "+a=6376523 +rf=308.64099709583735"),
+    ("+ellps=walbeck", "+a=6376896 +rf=302.78000018165636"),
+];
 
 /// Why text is not a projection that this build can compute.
 #[derive(Debug, thiserror::Error)]
@@ -62,9 +76,7 @@ impl Projection {
         let kind = if parameter(proj4, "proj") == Some("eqc") {
             Kind::Equirectangular(Equirectangular::new(proj4).map_err(|e| failed(e.to_owned()))?)
         } else {
-            let proj = Proj::from_proj_string(proj4)
-                .or_else(|_| Proj::from_proj_string(&without_grids(proj4)))
-                .map_err(|e| failed(e.to_string()))?;
+            let proj = Proj::from_proj_string(&rewritten(proj4)).map_err(|e| failed(e.to_string()))?;
             Kind::Proj(Box::new(proj))
         };
         let lonlat =
@@ -153,10 +165,19 @@ fn parameter<'a>(proj4: &'a str, key: &str) -> Option<&'a str> {
     proj4.split_whitespace().find_map(|word| word.strip_prefix('+')?.strip_prefix(key)?.strip_prefix('='))
 }
 
-/// The same definition with nothing that needs a shift grid.
-fn without_grids(proj4: &str) -> String {
-    let words = proj4.split_whitespace().filter(|word| !word.starts_with("+nadgrids="));
-    words.map(|w| if w == "+datum=NAD27" { NAD27_SHIFT } else { w }).collect::<Vec<_>>().join(" ")
+/// The same definition in words that proj4rs gets right, with nothing that needs a shift grid.
+fn rewritten(proj4: &str) -> String {
+    let (a, b) = ellipsoid(proj4);
+    let words = proj4.split_whitespace().filter_map(|word| {
+        let known = REWRITTEN.iter().find(|(from, _)| from.eq_ignore_ascii_case(word));
+        match known {
+            Some((_, to)) => Some((*to).to_owned()),
+            None if word.starts_with("+nadgrids=") && word != "+nadgrids=@null" => None,
+            None if word.starts_with("+b=") && a > b => Some(format!("+rf={}", a / (a - b))),
+            None => Some(word.to_owned()),
+        }
+    });
+    words.collect::<Vec<_>>().join(" ")
 }
 
 fn unit_metres(proj4: &str) -> f64 {
@@ -260,18 +281,43 @@ mod tests {
     #[test]
     fn inverse_undoes_forward() {
         let moon = Projection::new("+proj=eqc +lat_ts=30 +lon_0=10 +R=1737400").unwrap();
-        for projection in [of(32611), of(3857), of(2193), of(2227), of(4326), of(26710), of(25832), moon] {
-            for (lon, lat) in [(-119.5, 34.25), (12.0, 44.0), (172.0, -41.0)] {
-                let Some((x, y)) = projection.forward(lon, lat) else { continue };
-                let Some((lon2, lat2)) = projection.inverse(x, y) else { continue };
-                if (lon2 - lon).abs() < 90.0 && (x.abs() < 1e7) {
-                    assert!(
-                        (lon - lon2).abs() < 2e-5 && (lat - lat2).abs() < 2e-5,
-                        "{projection:?} {lon} {lat}"
-                    );
-                }
-            }
+        let cases = [
+            (of(32611), -119.5, 34.25),
+            (of(26710), -122.2, 46.2),
+            (of(2227), -119.5, 37.25),
+            (of(3857), 12.0, 44.0),
+            (of(25832), 12.0, 44.0),
+            (of(4326), 12.0, 44.0),
+            (of(2193), 172.0, -41.0),
+            (of(3031), 110.5, -66.5),
+            (of(32661), 40.0, 86.0),
+            (moon, -150.0, -41.0),
+        ];
+        for (projection, lon, lat) in cases {
+            let (x, y) = projection.forward(lon, lat).unwrap();
+            let (lon2, lat2) = projection.inverse(x, y).unwrap();
+            // A thousandth of a second; datum shifts are inverted by iteration.
+            assert!((lon - lon2).abs() < 3e-7 && (lat - lat2).abs() < 3e-7, "{projection:?} {lon2} {lat2}");
         }
+    }
+
+    /// Without shift grids the mean shift stands in. The northing of a parallel differs by 218.09 m between
+    /// the two ellipsoids (meridian arcs integrated numerically), and the datum moves by about 21 m back.
+    #[test]
+    fn nad27_is_shifted() {
+        let bare = Projection::new("+proj=utm +zone=10 +ellps=clrk66").unwrap();
+        let (x, y) = bare.to(&of(32610), 500_000.0, 5_115_000.0).unwrap();
+        assert!((x - 500_000.0).abs() < 0.01 && (y - 5_115_000.0 - 218.09).abs() < 0.1, "{x} {y}");
+        let (x, y) = of(26710).to(&of(32610), 562_000.0, 5_115_000.0).unwrap();
+        assert!((x - 561_906.0).abs() < 5.0 && (y - 5_115_196.0).abs() < 5.0, "{x} {y}");
+    }
+
+    /// Regression: proj4rs 0.1.5 takes f = (a - b) / b for an ellipsoid given by b.
+    #[test]
+    fn an_ellipsoid_is_the_same_by_either_axis() {
+        let y = |text: &str| Projection::new(text).unwrap().forward(9.0, 46.0).unwrap().1;
+        let by_b = y("+proj=utm +zone=32 +a=6378137 +b=6356752.314245179");
+        assert!((by_b - y("+proj=utm +zone=32 +ellps=WGS84")).abs() < 1e-3);
     }
 
     #[test]

@@ -59,7 +59,7 @@ impl Mosaic {
     }
 
     pub(super) fn first(&self) -> &Raster {
-        // Both constructors leave at least one part.
+        // `new` refuses an empty list.
         &self.parts[0].0
     }
 
@@ -132,7 +132,12 @@ fn offset(first: &Raster, second: &Raster) -> Result<[i64; 2]> {
     }
     let mut offset = [0; 2];
     for i in 0..2 {
-        let cells = (b.origin[i] - a.origin[i]) / a.step[i];
+        let mut distance = b.origin[i] - a.origin[i];
+        if i == 0 && a.crs.as_ref().is_some_and(|c| c.geographic) {
+            // Tiles on both sides of the antimeridian are neighbours.
+            distance -= (distance / 360.0).round() * 360.0;
+        }
+        let cells = distance / a.step[i];
         let whole = super::whole(cells.abs().round())
             .filter(|w| (f64::from(*w) - cells.abs()).abs() <= OFFSET_TOLERANCE);
         let Some(whole) = whole else {
