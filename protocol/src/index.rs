@@ -1,7 +1,8 @@
 //! Pages of the index: what a client must know of diamonds before it has their geometry.
 //!
-//! The squares of a root form a quadtree; a page holds [`BAND`] depths of it below one square. The
-//! square owns the diamond of its centre and those of its west and south sides (squares along the
+//! The squares of a root form a quadtree; a page holds [`BAND`] depths of it below one square (the topmost
+//! pages hold what remains above full ones: the many pages at the bottom are the full ones). The square
+//! owns the diamond of its centre and those of its west and south sides (squares along the
 //! forest's east and north borders own those sides too). So which diamonds a page holds, and in what
 //! order, follows from its number alone, and a page is nothing but columns of values.
 //!
@@ -121,10 +122,18 @@ fn squares(forest: &Forest, depth: u32) -> [u32; 2] {
     forest.roots().map(|r| r << depth)
 }
 
+/// The bands of the quadtree, from the top: first depth and number of depths.
+fn bands(forest: &Forest) -> impl Iterator<Item = (u32, u32)> + use<> {
+    let depths = depths(forest);
+    // At least one depth: a root square splits at least twice.
+    let top = (depths - 1) % BAND + 1;
+    std::iter::once((0, top)).chain((top..depths).step_by(BAND as usize).map(|first| (first, BAND)))
+}
+
 /// How many pages a layer's index has.
 #[must_use]
 pub fn pages(forest: &Forest) -> u32 {
-    (0..depths(forest).div_ceil(BAND)).map(|band| squares(forest, band * BAND)).map(|[c, r]| c * r).sum()
+    bands(forest).map(|(first, _)| squares(forest, first)).map(|[c, r]| c * r).sum()
 }
 
 /// The square that owns a diamond, with its depth.
@@ -140,26 +149,32 @@ fn owner(forest: &Forest, d: Diamond) -> (u32, [u32; 2]) {
 #[must_use]
 pub fn page_of(forest: &Forest, d: Diamond) -> u32 {
     let (depth, [i, j]) = owner(forest, d);
-    let band = depth / BAND;
-    let before: u32 = (0..band).map(|b| squares(forest, b * BAND)).map(|[c, r]| c * r).sum();
-    let up = depth - band * BAND;
-    before + (j >> up) * squares(forest, band * BAND)[0] + (i >> up)
+    let mut before = 0;
+    for (first, count) in bands(forest) {
+        let [columns, rows] = squares(forest, first);
+        if depth < first + count {
+            let up = depth - first;
+            return before + (j >> up) * columns + (i >> up);
+        }
+        before += columns * rows;
+    }
+    before
 }
 
 /// The diamonds of a page, in its order: depth by depth, row by row; `None` for a page that is not.
 #[must_use]
 pub fn page_diamonds(forest: &Forest, page: u32) -> Option<Vec<Diamond>> {
-    let mut first = 0;
-    for band in 0..depths(forest).div_ceil(BAND) {
-        let [columns, rows] = squares(forest, band * BAND);
-        if page - first >= columns * rows {
-            first += columns * rows;
+    let mut before = 0;
+    for (first, count) in bands(forest) {
+        let [columns, rows] = squares(forest, first);
+        if page - before >= columns * rows {
+            before += columns * rows;
             continue;
         }
-        let (i0, j0) = ((page - first) % columns, (page - first) / columns);
+        let (i0, j0) = ((page - before) % columns, (page - before) / columns);
         let mut list = Vec::with_capacity(1087);
-        for depth in band * BAND..(band * BAND + BAND).min(depths(forest)) {
-            let up = depth - band * BAND;
+        for depth in first..first + count {
+            let up = depth - first;
             let [across, along] = squares(forest, depth);
             let half = 1 << (forest.root_log2() - depth - 1);
             for j in j0 << up..(j0 + 1) << up {

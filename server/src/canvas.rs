@@ -119,7 +119,9 @@ impl Canvas {
             if inside == 0 || j >= plane.height {
                 break;
             }
-            plane.file.read_exact_at(&mut bytes, (u64::from(j) * u64::from(plane.width) + u64::from(i0)) * 4)?;
+            plane
+                .file
+                .read_exact_at(&mut bytes, (u64::from(j) * u64::from(plane.width) + u64::from(i0)) * 4)?;
             for (height, four) in row.iter_mut().zip(bytes.as_chunks::<4>().0) {
                 *height = i32::from_le_bytes(*four);
             }

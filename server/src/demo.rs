@@ -99,7 +99,9 @@ pub fn run(folder: &Path, samples: u32, listen: SocketAddr, headless: bool) -> R
             say(&format!("Picture: {}\nServing {url}", picture.display()));
             let program = client.display();
             say("Go on with, for instance:");
-            say(&format!("  {program} render {url} -o near.png --eye 655000,7955000,4200 --target 661000,7966000,1000"));
+            say(&format!(
+                "  {program} render {url} -o near.png --eye 655000,7955000,4200 --target 661000,7966000,1000"
+            ));
             say(&format!("  curl '{url}/terrain/height?x=660000&y=7966000'"));
         }
         if drawn.is_ok() && !headless {

@@ -82,7 +82,13 @@ pub fn to_lonlat(crs: Option<&Crs>, [x, y]: [f64; 2]) -> Option<(f64, f64)> {
 ///
 /// # Errors
 /// When the place is outside of the layer or the store is damaged.
-pub fn height(store: &Store, number: u8, layer: &Layer, crs: Option<&Crs>, [x, y]: [f64; 2]) -> Result<HeightAnswer, HeightError> {
+pub fn height(
+    store: &Store,
+    number: u8,
+    layer: &Layer,
+    crs: Option<&Crs>,
+    [x, y]: [f64; 2],
+) -> Result<HeightAnswer, HeightError> {
     let cells = layer.samples.map(|s| f64::from(s - 1));
     let at = [(x - layer.origin[0]) / layer.cell[0], (y - layer.origin[1]) / layer.cell[1]];
     if !(0.0..=cells[0]).contains(&at[0]) || !(0.0..=cells[1]).contains(&at[1]) {
@@ -143,7 +149,13 @@ pub fn height(store: &Store, number: u8, layer: &Layer, crs: Option<&Crs>, [x, y
 }
 
 /// Decodes a diamond with its ancestors.
-fn decode(store: &Store, number: u8, layer: &Layer, d: Diamond, done: &mut HashMap<Diamond, Block>) -> Result<Block, HeightError> {
+fn decode(
+    store: &Store,
+    number: u8,
+    layer: &Layer,
+    d: Diamond,
+    done: &mut HashMap<Diamond, Block>,
+) -> Result<Block, HeightError> {
     if let Some(block) = done.get(&d) {
         return Ok(block.clone());
     }
@@ -157,7 +169,8 @@ fn decode(store: &Store, number: u8, layer: &Layer, d: Diamond, done: &mut HashM
     if payload.is_none() {
         // No payload is right only where the index says so.
         let page = diamantina_protocol::index::page_of(&layer.forest, d);
-        let entries = read_page(store, number, layer, page).map_err(|e| HeightError::Damaged(e.to_string()))?;
+        let entries =
+            read_page(store, number, layer, page).map_err(|e| HeightError::Damaged(e.to_string()))?;
         if entries.iter().any(|(other, e)| *other == d && e.bytes > 0) {
             return Err(HeightError::Damaged(format!("the points of diamond {:?} are missing", [a, b])));
         }

@@ -68,7 +68,9 @@ pub enum BuildError {
         error: io::Error,
     },
     /// No sample has a height.
-    #[error("the source has no data: all {0} samples are nodata; check its nodata value, or give another with --nodata")]
+    #[error(
+        "the source has no data: all {0} samples are nodata; check its nodata value, or give another with --nodata"
+    )]
     AllNodata(u64),
     /// Heights do not fit in the integers of the format.
     #[error("height {value} is {} quanta of {quantum} m, beyond {SOURCE_MAX}: give a larger --quantum", (value / quantum).round())]
@@ -140,7 +142,12 @@ pub struct Report {
 /// # Errors
 /// When the source or the disk fails, or the options do not fit the source. The store at `out`, if there
 /// was one, is then untouched.
-pub fn build(source: &Source, out: &Path, options: &Options, progress: &Progress) -> Result<Report, BuildError> {
+pub fn build(
+    source: &Source,
+    out: &Path,
+    options: &Options,
+    progress: &Progress,
+) -> Result<Report, BuildError> {
     let started = std::time::Instant::now();
     let grid = source.grid();
     let forest = Forest::covering(grid.width, grid.height, options.patch_log2)
@@ -168,11 +175,18 @@ pub fn build(source: &Source, out: &Path, options: &Options, progress: &Progress
     progress.stage("publish", 0);
     let crs = grid.crs.as_ref().map(|crs| {
         let per_metre = [crs.step[0] / grid.cell[0], crs.step[1] / grid.cell[1]];
-        let origin = [crs.origin[0] - grid.origin[0] * per_metre[0], crs.origin[1] - grid.origin[1] * per_metre[1]];
+        let origin =
+            [crs.origin[0] - grid.origin[0] * per_metre[0], crs.origin[1] - grid.origin[1] * per_metre[1]];
         Crs { name: crs.name.clone(), proj4: crs.proj4.clone(), origin, per_metre }
     });
     let frame = Frame { crs, vertical_unit: "metre".to_owned() };
-    let scene = Scene { name: options.scene.clone(), version: String::new(), frame, layers: vec![layer], zones: Vec::new() };
+    let scene = Scene {
+        name: options.scene.clone(),
+        version: String::new(),
+        frame,
+        layers: vec![layer],
+        zones: Vec::new(),
+    };
     let scene = writer.publish(scene)?;
     progress.finish();
     let samples = u64::from(grid.width) * u64::from(grid.height);
@@ -287,7 +301,11 @@ fn find_quantum(source: &Source, options: &Options) -> Result<f64, BuildError> {
     let grid = source.grid();
     let scale = grid.height_scale.abs();
     if let Some(quantum) = options.quantum {
-        return if quantum > 0.0 && quantum.is_finite() { Ok(quantum) } else { Err(BuildError::Quantum(quantum)) };
+        return if quantum > 0.0 && quantum.is_finite() {
+            Ok(quantum)
+        } else {
+            Err(BuildError::Quantum(quantum))
+        };
     }
     if grid.integer {
         return Ok(scale);
@@ -310,10 +328,13 @@ fn find_quantum(source: &Source, options: &Options) -> Result<f64, BuildError> {
     }
     // Heights read from 32-bit floats are within half a unit in their last place of a decimal.
     let slack = |h: f64| h.abs() * 1e-6;
-    let has_step = |step: f64| heights.iter().all(|h| (h - (h / step).round() * step).abs() <= slack(*h).min(step / 8.0));
+    let has_step = |step: f64| {
+        heights.iter().all(|h| (h - (h / step).round() * step).abs() <= slack(*h).min(step / 8.0))
+    };
     let decimal = [1.0, 0.1, 0.01, 0.001].into_iter().find(|step| has_step(*step));
     let fine = power_of_ten((high - low) / 65536.0).min(0.01);
-    let asked = if options.max_error > 0.0 { power_of_ten(options.max_error / 50.0).min(high - low) } else { 0.0 };
+    let asked =
+        if options.max_error > 0.0 { power_of_ten(options.max_error / 50.0).min(high - low) } else { 0.0 };
     let quantum = match decimal {
         Some(step) if options.max_error == 0.0 || step <= options.max_error => step,
         _ => fine.max(asked),
@@ -322,7 +343,13 @@ fn find_quantum(source: &Source, options: &Options) -> Result<f64, BuildError> {
 }
 
 /// Reads the whole source into a canvas of quanta.
-fn transcribe(source: &Source, plan: &Plan, options: &Options, folder: &Path, progress: &Progress) -> Result<(Canvas, Stats), BuildError> {
+fn transcribe(
+    source: &Source,
+    plan: &Plan,
+    options: &Options,
+    folder: &Path,
+    progress: &Progress,
+) -> Result<(Canvas, Stats), BuildError> {
     let grid = source.grid();
     let quantum = find_quantum(source, options)?;
     let work = |error: io::Error| BuildError::Work { path: folder.to_owned(), error };
@@ -393,7 +420,8 @@ fn fine_step(max_error: f64, stats: &Stats) -> Result<u32, BuildError> {
 /// pay for a precision that they cannot show.
 fn exponents(plan: &Plan, canvas: &Canvas, fine_step: u32) -> io::Result<Vec<u8>> {
     let forest = &plan.forest;
-    let details: Vec<f64> = (0..forest.levels()).map(|level| detail(plan, canvas, level)).collect::<io::Result<_>>()?;
+    let details: Vec<f64> =
+        (0..forest.levels()).map(|level| detail(plan, canvas, level)).collect::<io::Result<_>>()?;
     let mut exponents = vec![0u8; forest.levels() as usize + 1];
     // exponents[i + 1] is level i's; a level's step follows the detail of the level after it.
     for i in (0..forest.levels() as usize).rev() {
@@ -432,7 +460,12 @@ fn detail(plan: &Plan, canvas: &Canvas, level: u32) -> io::Result<f64> {
                         if odd != (1, 1) {
                             continue;
                         }
-                        [(x - step, y - step), (x + step, y - step), (x + step, y + step), (x - step, y + step)]
+                        [
+                            (x - step, y - step),
+                            (x + step, y - step),
+                            (x + step, y + step),
+                            (x - step, y + step),
+                        ]
                     } else {
                         if odd.0 == odd.1 {
                             continue;
@@ -533,7 +566,13 @@ struct Build<'a> {
 fn blob_order(forest: &Forest, d: Diamond) -> u64 {
     let spread = |v: u32| {
         let mut v = u64::from(v) & 0x0fff_ffff;
-        for (shift, mask) in [(16, 0x0000_ffff_0000_ffff_u64), (8, 0x00ff_00ff_00ff_00ff), (4, 0x0f0f_0f0f_0f0f_0f0f), (2, 0x3333_3333_3333_3333), (1, 0x5555_5555_5555_5555)] {
+        for (shift, mask) in [
+            (16, 0x0000_ffff_0000_ffff_u64),
+            (8, 0x00ff_00ff_00ff_00ff),
+            (4, 0x0f0f_0f0f_0f0f_0f0f),
+            (2, 0x3333_3333_3333_3333),
+            (1, 0x5555_5555_5555_5555),
+        ] {
             v = (v | v << shift) & mask;
         }
         v
@@ -647,7 +686,13 @@ impl Build<'_> {
                 measure(forest, level, samples, |x, y| surface.at(x, y), &mut found);
             }
             if let Some(last) = surfaces.last() {
-                let worst = last.heights.iter().zip(&heights).filter(|(_, s)| **s != NODATA).map(|(h, s)| h.abs_diff(*s)).max();
+                let worst = last
+                    .heights
+                    .iter()
+                    .zip(&heights)
+                    .filter(|(_, s)| **s != NODATA)
+                    .map(|(h, s)| h.abs_diff(*s))
+                    .max();
                 finest = f64::from(worst.unwrap_or(0));
             }
         }
@@ -662,8 +707,15 @@ impl Build<'_> {
 
     /// The diamonds of a chunk, level by level: ranges of those that it owns, and the surfaces of the
     /// levels below the chunk's own, over the chunk.
-    #[allow(clippy::type_complexity, reason = "two results of one pass, taken apart at once by the only caller")]
-    fn chunk_diamonds(&self, corner: [u32; 2], coarse: &Coarse) -> Result<(Vec<(Diamond, Coded)>, Vec<Surface>), BuildError> {
+    #[allow(
+        clippy::type_complexity,
+        reason = "two results of one pass, taken apart at once by the only caller"
+    )]
+    fn chunk_diamonds(
+        &self,
+        corner: [u32; 2],
+        coarse: &Coarse,
+    ) -> Result<(Vec<(Diamond, Coded)>, Vec<Surface>), BuildError> {
         let forest = &self.plan.forest;
         let side = 1u32 << self.plan.chunk_log2();
         let needed = needed(&self.plan, corner);
@@ -711,11 +763,17 @@ impl Build<'_> {
         let forest = &self.plan.forest;
         let tallies = self.tallies.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         let cell = self.grid.cell;
-        let finest = up((tallies.finest * stats.quantum + stats.rounding) * (1.0 + 1e-9));
+        // Room for the rounding of metres, where they are not whole.
+        let slack = if stats.quantum.fract() == 0.0 && stats.rounding == 0.0 { 1.0 } else { 1.0 + 1e-9 };
+        let finest = up((tallies.finest * stats.quantum + stats.rounding) * slack);
         let mut entries: HashMap<Diamond, Entry> = HashMap::new();
         for level in (0..forest.levels()).rev() {
             let [along, across] = forest.hypotenuse(level);
-            let hypotenuse = if across > 0.0 { (along * cell[0]).hypot(across * cell[1]) } else { along * cell[0].max(cell[1]) };
+            let hypotenuse = if across > 0.0 {
+                (along * cell[0]).hypot(across * cell[1])
+            } else {
+                along * cell[0].max(cell[1])
+            };
             for d in forest.diamonds(level) {
                 let mut entry = Entry::EMPTY;
                 let coded = tallies.ranges.get(&d);
@@ -726,7 +784,7 @@ impl Build<'_> {
                 let own = tallies.found.get(&d).map_or(0.0, |f| {
                     f.vertical * stats.quantum + stats.rounding + if f.outline { hypotenuse } else { 0.0 }
                 });
-                entry.error_metres = up(own * (1.0 + 1e-9));
+                entry.error_metres = up(own * slack);
                 for child in forest.children(d).into_iter().flatten().filter_map(|c| entries.get(&c)) {
                     if !child.is_empty() {
                         entry.error_metres = entry.error_metres.max(child.error_metres);
@@ -744,10 +802,15 @@ impl Build<'_> {
         let mut bytes: u64 = entries.values().map(|e| u64::from(e.bytes)).sum();
         for page in 0..index::pages(forest) {
             let diamonds = index::page_diamonds(forest, page).unwrap_or_default();
-            let list: Vec<Entry> = diamonds.iter().map(|d| entries.get(d).copied().unwrap_or(Entry::EMPTY)).collect();
-            let blob = zstd::encode_all(index::encode(&list).as_slice(), 12).map_err(self.work())?;
+            let list: Vec<Entry> =
+                diamonds.iter().map(|d| entries.get(d).copied().unwrap_or(Entry::EMPTY)).collect();
+            let blob = zstd::bulk::compress(&index::encode(&list), 12).map_err(self.work())?;
             bytes += blob.len() as u64;
-            self.writer.put(Key { layer: 0, kind: BlobKind::Index, a: page, b: 0 }, u64::from(page), &blob)?;
+            self.writer.put(
+                Key { layer: 0, kind: BlobKind::Index, a: page, b: 0 },
+                u64::from(page),
+                &blob,
+            )?;
         }
         let offset = self.grid.height_offset;
         Ok(Layer {
@@ -760,7 +823,10 @@ impl Build<'_> {
             valid_samples: stats.valid,
             quantum: stats.quantum,
             height_offset: offset,
-            heights: [f64::from(stats.low) * stats.quantum + offset, f64::from(stats.high) * stats.quantum + offset],
+            heights: [
+                f64::from(stats.low) * stats.quantum + offset,
+                f64::from(stats.high) * stats.quantum + offset,
+            ],
             max_error: options.max_error,
             finest_error: finest,
             encodings: vec!["points".to_owned()],
@@ -805,7 +871,12 @@ fn needed(plan: &Plan, corner: [u32; 2]) -> Vec<BTreeSet<Diamond>> {
         first.insert(own);
     }
     for i in 1..levels.len() {
-        let next: BTreeSet<_> = levels[i - 1].iter().flat_map(|d| forest.children(*d)).flatten().filter(|d| overlaps(*d)).collect();
+        let next: BTreeSet<_> = levels[i - 1]
+            .iter()
+            .flat_map(|d| forest.children(*d))
+            .flatten()
+            .filter(|d| overlaps(*d))
+            .collect();
         levels[i] = next;
     }
     // Upward: the other parents of what straddles the border.

@@ -15,7 +15,9 @@ use axum::middleware::{self, Next};
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
 use diamantina_protocol::index;
-use diamantina_protocol::message::{self, BATCH_MAX, Catalogue, FrameHeader, Layer, PAYLOAD_BYTES_MAX, Problem, Scene, Status};
+use diamantina_protocol::message::{
+    self, BATCH_MAX, Catalogue, FrameHeader, Layer, PAYLOAD_BYTES_MAX, Problem, Scene, Status,
+};
 use std::collections::{BTreeMap, HashMap};
 use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -36,7 +38,9 @@ pub enum ServeError {
     #[error(transparent)]
     Store(#[from] StoreError),
     /// Two stores hold scenes of one name.
-    #[error("{first} and {second} both hold a scene named '{name}': build one of them again with another --scene NAME")]
+    #[error(
+        "{first} and {second} both hold a scene named '{name}': build one of them again with another --scene NAME"
+    )]
     SameName {
         /// The name.
         name: String,
@@ -139,7 +143,8 @@ impl Server {
                 stop.await;
                 let _ = stopping.send(());
             };
-            let serving = axum::serve(listener, router(self.scenes)).with_graceful_shutdown(signalled).into_future();
+            let serving =
+                axum::serve(listener, router(self.scenes)).with_graceful_shutdown(signalled).into_future();
             let deadline = async move {
                 // Connections that stay open for nothing do not keep the process.
                 if stopped.await.is_err() {
@@ -186,8 +191,12 @@ pub fn router(scenes: Scenes) -> Router {
         .route("/scenes/{scene}/{version}/{layer}/index/{page}", get(index_page))
         .route("/scenes/{scene}/{version}/{layer}/points", get(batch))
         .route("/scenes/{scene}/{version}/{layer}/points/{x}/{y}", get(diamond))
-        .fallback(|| async { Refusal::new(StatusCode::NOT_FOUND, "no such address: GET /scenes lists what there is") })
-        .method_not_allowed_fallback(|| async { Refusal::new(StatusCode::METHOD_NOT_ALLOWED, "only GET and HEAD are answered") })
+        .fallback(|| async {
+            Refusal::new(StatusCode::NOT_FOUND, "no such address: GET /scenes lists what there is")
+        })
+        .method_not_allowed_fallback(|| async {
+            Refusal::new(StatusCode::METHOD_NOT_ALLOWED, "only GET and HEAD are answered")
+        })
         .layer(middleware::from_fn(common_headers))
         .with_state(scenes)
 }
@@ -209,7 +218,8 @@ impl IntoResponse for Refusal {
         let title = self.status.canonical_reason().unwrap_or("Error").to_owned();
         let problem = Problem { title, status: self.status.as_u16(), detail: self.detail };
         let body = serde_json::to_vec(&problem).unwrap_or_default();
-        let headers = [(header::CONTENT_TYPE, "application/problem+json"), (header::CACHE_CONTROL, "no-store")];
+        let headers =
+            [(header::CONTENT_TYPE, "application/problem+json"), (header::CACHE_CONTROL, "no-store")];
         (self.status, headers, body).into_response()
     }
 }
@@ -237,10 +247,18 @@ async fn common_headers(request: Request, next: Next) -> Response {
 }
 
 /// An answer with an ETag, or 304 where the client has it already.
-fn tagged(headers: &HeaderMap, tag: &str, cache: &'static str, kind: &'static str, body: impl FnOnce() -> Bytes) -> Response {
+fn tagged(
+    headers: &HeaderMap,
+    tag: &str,
+    cache: &'static str,
+    kind: &'static str,
+    body: impl FnOnce() -> Bytes,
+) -> Response {
     let tag = format!("\"{tag}\"");
     let known = headers.get_all(header::IF_NONE_MATCH).iter().filter_map(|v| v.to_str().ok());
-    let fresh = known.flat_map(|v| v.split(',')).any(|v| matches!(v.trim(), "*") || v.trim().trim_start_matches("W/") == tag);
+    let fresh = known
+        .flat_map(|v| v.split(','))
+        .any(|v| matches!(v.trim(), "*") || v.trim().trim_start_matches("W/") == tag);
     let common = [(header::ETAG, tag), (header::CACHE_CONTROL, cache.to_owned())];
     if fresh {
         return (StatusCode::NOT_MODIFIED, common).into_response();
@@ -265,7 +283,9 @@ async fn front_page(State(scenes): State<Scenes>) -> Html<String> {
     );
     for name in scenes.keys() {
         // Names are letters, digits, '-', '_' and '.': nothing to escape.
-        page += &format!("<li><a href=/scenes/{name}>{name}</a> <code>diamantina-client render http://THIS-SERVER/scenes/{name} -o {name}.png</code>");
+        page += &format!(
+            "<li><a href=/scenes/{name}>{name}</a> <code>diamantina-client render http://THIS-SERVER/scenes/{name} -o {name}.png</code>"
+        );
     }
     page += "</ul><p><a href=/scenes>All scenes as JSON</a></html>";
     Html(page)
@@ -277,13 +297,16 @@ async fn catalogue(State(scenes): State<Scenes>, headers: HeaderMap) -> Response
 }
 
 fn find_scene<'a>(scenes: &'a Scenes, name: &str) -> Result<&'a Arc<Store>, Refusal> {
-    scenes.get(name).ok_or_else(|| Refusal::new(StatusCode::NOT_FOUND, "no such scene: GET /scenes lists them"))
+    scenes
+        .get(name)
+        .ok_or_else(|| Refusal::new(StatusCode::NOT_FOUND, "no such scene: GET /scenes lists them"))
 }
 
 /// The layer of an address, with its number.
 fn find_layer<'a>(store: &'a Store, name: &str) -> Result<(u8, &'a Layer), Refusal> {
     let found = store.scene().layers.iter().enumerate().find(|(_, l)| l.name == name);
-    let (number, layer) = found.ok_or_else(|| Refusal::new(StatusCode::NOT_FOUND, "no such layer in this scene"))?;
+    let (number, layer) =
+        found.ok_or_else(|| Refusal::new(StatusCode::NOT_FOUND, "no such layer in this scene"))?;
     Ok((u8::try_from(number).unwrap_or(u8::MAX), layer))
 }
 
@@ -294,10 +317,17 @@ fn find_version<'a>(scenes: &'a Scenes, name: &str, version: &str) -> Result<&'a
     if current == version {
         return Ok(store);
     }
-    Err(Refusal::new(StatusCode::GONE, format!("scene '{name}' is now at version {current}: load its description again")))
+    Err(Refusal::new(
+        StatusCode::GONE,
+        format!("scene '{name}' is now at version {current}: load its description again"),
+    ))
 }
 
-async fn scene(State(scenes): State<Scenes>, UrlPath(name): UrlPath<String>, headers: HeaderMap) -> Result<Response, Refusal> {
+async fn scene(
+    State(scenes): State<Scenes>,
+    UrlPath(name): UrlPath<String>,
+    headers: HeaderMap,
+) -> Result<Response, Refusal> {
     Ok(json(&headers, find_scene(&scenes, &name)?.scene()))
 }
 
@@ -309,7 +339,9 @@ async fn index_page(
     let store = find_version(&scenes, &name, &version)?;
     let (number, layer) = find_layer(store, &layer)?;
     let pages = index::pages(&layer.forest);
-    let missing = || Refusal::new(StatusCode::NOT_FOUND, format!("no such page: the index has pages 0 to {}", pages - 1));
+    let missing = || {
+        Refusal::new(StatusCode::NOT_FOUND, format!("no such page: the index has pages 0 to {}", pages - 1))
+    };
     let page: u32 = page.parse().map_err(|_| missing())?;
     let blob = store.get(Key { layer: number, kind: Kind::Index, a: page, b: 0 })?.ok_or_else(missing)?;
     Ok(tagged(&headers, &format!("{version}-{number}-i{page}"), IMMUTABLE, OCTETS, || blob))
@@ -325,7 +357,9 @@ async fn diamond(
     let no_diamond = || Refusal::new(StatusCode::NOT_FOUND, "no diamond with a payload has its centre there");
     let centre = [x.parse().map_err(|_| no_diamond())?, y.parse().map_err(|_| no_diamond())?];
     layer.forest.diamond(centre).ok_or_else(no_diamond)?;
-    let blob = store.get(Key { layer: number, kind: Kind::Points, a: centre[0], b: centre[1] })?.ok_or_else(no_diamond)?;
+    let blob = store
+        .get(Key { layer: number, kind: Kind::Points, a: centre[0], b: centre[1] })?
+        .ok_or_else(no_diamond)?;
     Ok(tagged(&headers, &format!("{version}-{number}-p{x}-{y}"), IMMUTABLE, OCTETS, || blob))
 }
 
@@ -339,13 +373,18 @@ async fn batch(
         let (number, layer) = find_layer(&store, &layer)?;
         (number, layer.forest)
     };
-    let list = query.get("d").ok_or_else(|| Refusal::new(StatusCode::BAD_REQUEST, "expected ?d=x,y;x,y;..."))?;
+    let list =
+        query.get("d").ok_or_else(|| Refusal::new(StatusCode::BAD_REQUEST, "expected ?d=x,y;x,y;..."))?;
     let centres = message::parse_batch(list).map_err(|e| match e {
-        message::BatchError::Many => Refusal::new(StatusCode::PAYLOAD_TOO_LARGE, format!("at most {BATCH_MAX} diamonds in one request")),
+        message::BatchError::Many => Refusal::new(
+            StatusCode::PAYLOAD_TOO_LARGE,
+            format!("at most {BATCH_MAX} diamonds in one request"),
+        ),
         message::BatchError::Syntax(_) => Refusal::new(StatusCode::BAD_REQUEST, e.to_string()),
     })?;
     // Coarse first, so that whatever arrives can be decoded; unknown centres last.
-    let mut order: Vec<_> = centres.into_iter().map(|c| (forest.diamond(c).map_or(u32::MAX, |d| d.level()), c)).collect();
+    let mut order: Vec<_> =
+        centres.into_iter().map(|c| (forest.diamond(c).map_or(u32::MAX, |d| d.level()), c)).collect();
     order.sort_by_key(|(level, _)| *level);
     let (sender, receiver) = tokio::sync::mpsc::channel::<Result<Bytes, std::io::Error>>(FRAMES_AHEAD);
     tokio::task::spawn_blocking(move || {
@@ -356,7 +395,8 @@ async fn batch(
             }
         }
     });
-    let frames = futures_util::stream::unfold(receiver, |mut r| async move { r.recv().await.map(|frame| (frame, r)) });
+    let frames =
+        futures_util::stream::unfold(receiver, |mut r| async move { r.recv().await.map(|frame| (frame, r)) });
     let headers = [(header::CONTENT_TYPE, OCTETS), (header::CACHE_CONTROL, IMMUTABLE)];
     Ok((headers, Body::from_stream(frames)).into_response())
 }
@@ -399,12 +439,19 @@ async fn height_at(
         let place = match asked {
             (Some(x), Some(y), None, None) => [x, y],
             (None, None, Some(lon), Some(lat)) => height::to_frame(crs, lon, lat).map_err(refuse_height)?,
-            _ => return Err(Refusal::new(StatusCode::BAD_REQUEST, "expected ?x=&y= in metres or ?lon=&lat= in degrees")),
+            _ => {
+                return Err(Refusal::new(
+                    StatusCode::BAD_REQUEST,
+                    "expected ?x=&y= in metres or ?lon=&lat= in degrees",
+                ));
+            }
         };
         let (number, layer) = find_layer(&store, &layer)?;
         height::height(&store, number, layer, crs, place).map_err(refuse_height)
     });
-    let answer = answer.await.map_err(|_| Refusal::new(StatusCode::INTERNAL_SERVER_ERROR, "the height could not be computed"))??;
+    let answer = answer
+        .await
+        .map_err(|_| Refusal::new(StatusCode::INTERNAL_SERVER_ERROR, "the height could not be computed"))??;
     Ok(([(header::CACHE_CONTROL, "no-cache")], axum::Json(answer)).into_response())
 }
 

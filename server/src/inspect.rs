@@ -51,7 +51,9 @@ pub enum InspectError {
         centre: [u32; 2],
     },
     /// A payload is not what the index says.
-    #[error("layer {layer}: the points of diamond {centre:?} have {found} bytes, the index says {expected}; build the store again")]
+    #[error(
+        "layer {layer}: the points of diamond {centre:?} have {found} bytes, the index says {expected}; build the store again"
+    )]
     Size {
         /// The layer.
         layer: String,
@@ -151,7 +153,12 @@ pub fn entries(store: &Store, number: u8, layer: &Layer) -> Result<HashMap<Diamo
 ///
 /// # Errors
 /// When it is missing or damaged.
-pub fn read_page(store: &Store, number: u8, layer: &Layer, page: u32) -> Result<Vec<(Diamond, Entry)>, InspectError> {
+pub fn read_page(
+    store: &Store,
+    number: u8,
+    layer: &Layer,
+    page: u32,
+) -> Result<Vec<(Diamond, Entry)>, InspectError> {
     let name = || layer.name.clone();
     let key = Key { layer: number, kind: Kind::Index, a: page, b: 0 };
     let blob = store.get(key)?.ok_or_else(|| InspectError::NoPage { layer: name(), page })?;
@@ -181,7 +188,12 @@ pub fn inspect(store: &Store, verify: bool) -> Result<Inspection, InspectError> 
                         Some(e) if e.bytes == bytes => {}
                         Some(e) => {
                             let (layer, centre) = (layer.name.clone(), [key.a, key.b]);
-                            return Err(InspectError::Size { layer, centre, found: bytes, expected: e.bytes });
+                            return Err(InspectError::Size {
+                                layer,
+                                centre,
+                                found: bytes,
+                                expected: e.bytes,
+                            });
                         }
                         None => strays += 1,
                     }
@@ -197,7 +209,12 @@ pub fn inspect(store: &Store, verify: bool) -> Result<Inspection, InspectError> 
     Ok(Inspection { scene: store.scene().clone(), layers, verified: verify })
 }
 
-fn summary(layer: &Layer, entries: &HashMap<Diamond, Entry>, index_bytes: u64, tally: Option<(u64, u64)>) -> LayerInspection {
+fn summary(
+    layer: &Layer,
+    entries: &HashMap<Diamond, Entry>,
+    index_bytes: u64,
+    tally: Option<(u64, u64)>,
+) -> LayerInspection {
     let mut levels: Vec<LevelInspection> = (0..layer.forest.levels())
         .map(|level| LevelInspection {
             level,
@@ -232,7 +249,12 @@ fn summary(layer: &Layer, entries: &HashMap<Diamond, Entry>, index_bytes: u64, t
 }
 
 /// Decodes every diamond of a layer, level by level; the real and the fictitious points.
-fn verify_layer(store: &Store, number: u8, layer: &Layer, entries: &HashMap<Diamond, Entry>) -> Result<(u64, u64), InspectError> {
+fn verify_layer(
+    store: &Store,
+    number: u8,
+    layer: &Layer,
+    entries: &HashMap<Diamond, Entry>,
+) -> Result<(u64, u64), InspectError> {
     let (mut real, mut fictitious) = (0, 0);
     decode_levels(store, number, layer, entries, |_, blocks| {
         for (_, _, tally) in blocks {
@@ -259,7 +281,8 @@ pub fn decode_levels(
     let forest: &Forest = &layer.forest;
     let mut before: HashMap<Diamond, Block> = HashMap::new();
     for level in 0..forest.levels() {
-        let filled: Vec<Diamond> = forest.diamonds(level).filter(|d| entries.get(d).is_some_and(|e| !e.is_empty())).collect();
+        let filled: Vec<Diamond> =
+            forest.diamonds(level).filter(|d| entries.get(d).is_some_and(|e| !e.is_empty())).collect();
         let blocks: Vec<(Diamond, Block, Tally)> = filled
             .into_par_iter()
             .map(|d| {
@@ -274,8 +297,13 @@ pub fn decode_levels(
                 if payload.is_none() && entries.get(&d).is_some_and(|e| e.bytes > 0) {
                     return Err(InspectError::NoPoints { layer: layer.name.clone(), centre: [a, b] });
                 }
-                let tally = points::decode(forest, &layer.coding, d, &mut block, &payload.unwrap_or_default())
-                    .map_err(|error| InspectError::Points { layer: layer.name.clone(), centre: [a, b], error })?;
+                let tally =
+                    points::decode(forest, &layer.coding, d, &mut block, &payload.unwrap_or_default())
+                        .map_err(|error| InspectError::Points {
+                            layer: layer.name.clone(),
+                            centre: [a, b],
+                            error,
+                        })?;
                 Ok((d, block, tally))
             })
             .collect::<Result<_, InspectError>>()?;

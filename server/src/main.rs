@@ -13,6 +13,11 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+/// A build frees and takes windows of megabytes all the time; the system's allocator hands each back to
+/// the kernel, and two thirds of the time went into page faults.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
 /// Builds and serves streamed terrain.
 #[derive(Parser)]
 #[command(version, about, propagate_version = true)]
@@ -144,7 +149,8 @@ fn parse_bytes(text: &str) -> Result<u64, String> {
         "GB" => 1_000_000_000,
         _ => return Err(format!("unit '{unit}': expected KiB, MiB, GiB, kB, MB or GB, as in 2GiB")),
     };
-    let value: u64 = number.parse().map_err(|_| "expected a whole number with a unit, as in 2GiB".to_owned())?;
+    let value: u64 =
+        number.parse().map_err(|_| "expected a whole number with a unit, as in 2GiB".to_owned())?;
     value.checked_mul(scale).ok_or_else(|| "more than 16 EiB".to_owned())
 }
 
@@ -183,11 +189,20 @@ fn scene_name(given: Option<String>, store: &Path) -> Result<String, Failure> {
         return if is_name(&name) {
             Ok(name)
         } else {
-            Err(Failure(2, format!("--scene '{name}': expected 1 to 64 letters, digits, '-', '_' or '.', not starting with '.'")))
+            Err(Failure(
+                2,
+                format!(
+                    "--scene '{name}': expected 1 to 64 letters, digits, '-', '_' or '.', not starting with '.'"
+                ),
+            ))
         };
     }
     let folder = store.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    let fit: String = folder.chars().map(|c| if c.is_ascii_alphanumeric() || "._-".contains(c) { c } else { '-' }).take(64).collect();
+    let fit: String = folder
+        .chars()
+        .map(|c| if c.is_ascii_alphanumeric() || "._-".contains(c) { c } else { '-' })
+        .take(64)
+        .collect();
     let fit = fit.trim_start_matches('.').to_owned();
     Ok(if fit.is_empty() { "scene".to_owned() } else { fit })
 }
@@ -276,7 +291,13 @@ fn print_inspection(out: &mut impl Write, i: &Inspection) -> std::io::Result<()>
         writeln!(
             out,
             "layer {}: {} x {} samples of {:.3} x {:.3} m, {columns} x {rows} roots, quantum {} m, errors {}",
-            layer.name, about.samples[0], about.samples[1], about.cell[0], about.cell[1], about.quantum, layer.errors
+            layer.name,
+            about.samples[0],
+            about.samples[1],
+            about.cell[0],
+            about.cell[1],
+            about.quantum,
+            layer.errors
         )?;
         writeln!(out, "  level  diamonds        bytes     step [m]   error min [m]   error max [m]")?;
         for l in &layer.levels {

@@ -48,7 +48,13 @@ pub struct Samples<'a> {
 ///
 /// The rectangle must be a square of the quadtree of roots, so that it is made of whole cells or lies
 /// within one.
-pub fn measure(forest: &Forest, level: u32, samples: Samples<'_>, node: impl Fn(u32, u32) -> i32, found: &mut HashMap<Diamond, Found>) {
+pub fn measure(
+    forest: &Forest,
+    level: u32,
+    samples: Samples<'_>,
+    node: impl Fn(u32, u32) -> i32,
+    found: &mut HashMap<Diamond, Found>,
+) {
     let spacing = 1u32 << (forest.root_log2() - forest.patch_log2() - level / 2);
     let macro_log2 = forest.root_log2() - level / 2;
     let [x0, y0] = samples.origin;
@@ -62,7 +68,9 @@ pub fn measure(forest: &Forest, level: u32, samples: Samples<'_>, node: impl Fn(
         while square_x < x1 {
             let mut local = [Found::default(); 4];
             for cell_y in (first(y0.max(square_y))..y1.min(square_y + macro_side)).step_by(spacing as usize) {
-                for cell_x in (first(x0.max(square_x))..x1.min(square_x + macro_side)).step_by(spacing as usize) {
+                for cell_x in
+                    (first(x0.max(square_x))..x1.min(square_x + macro_side)).step_by(spacing as usize)
+                {
                     let cell = Square { x: cell_x, y: cell_y, side: spacing };
                     if level.is_multiple_of(2) {
                         halves(cell, samples, &node, &mut local[0]);
@@ -124,7 +132,9 @@ fn halves(cell: Square, samples: Samples<'_>, node: &impl Fn(u32, u32) -> i32, f
         } else {
             (
                 plane(value(sw), value(se), value(nw), |sw, se, nw| (sw + (nw - sw) * t, (se - sw) / s)),
-                plane(value(nw), value(ne), value(se), |nw, ne, se| (nw + (se - ne) * (1.0 - t), (ne - nw) / s)),
+                plane(value(nw), value(ne), value(se), |nw, ne, se| {
+                    (nw + (se - ne) * (1.0 - t), (ne - nw) / s)
+                }),
             )
         };
         let edges = |a: i32, b: i32| a != NODATA && b != NODATA;
@@ -138,7 +148,13 @@ fn halves(cell: Square, samples: Samples<'_>, node: &impl Fn(u32, u32) -> i32, f
 
 /// The four triangles of a cell of an odd level, each with the middle as its apex; `local` by side of
 /// the macro-square: south, east, north, west.
-fn quarters(cell: Square, around: Square, samples: Samples<'_>, node: &impl Fn(u32, u32) -> i32, local: &mut [Found; 4]) {
+fn quarters(
+    cell: Square,
+    around: Square,
+    samples: Samples<'_>,
+    node: &impl Fn(u32, u32) -> i32,
+    local: &mut [Found; 4],
+) {
     let Square { x, y, side } = cell;
     let half = side / 2;
     let corners = [node(x, y), node(x + side, y), node(x + side, y + side), node(x, y + side)];
@@ -146,7 +162,8 @@ fn quarters(cell: Square, around: Square, samples: Samples<'_>, node: &impl Fn(u
     let s = f64::from(side);
     let value = |h: i32| (h != NODATA).then_some(f64::from(h));
     // Which triangle of the macro-square each quarter lies in: by its centroid, in sixths of a cell.
-    let centre = |w: u32, w0: u32| 6 * i64::from(w - w0) / i64::from(side) - 3 * i64::from(around.side / side);
+    let centre =
+        |w: u32, w0: u32| 6 * i64::from(w - w0) / i64::from(side) - 3 * i64::from(around.side / side);
     let of_quarter: [usize; 4] = [[3, 1], [5, 3], [3, 5], [1, 3]].map(|[cx, cy]| {
         let (dx, dy) = (centre(x, around.x) + cx, centre(y, around.y) + cy);
         match (dx.abs() > dy.abs(), dx > 0, dy > 0) {
@@ -172,24 +189,58 @@ fn quarters(cell: Square, around: Square, samples: Samples<'_>, node: &impl Fn(u
             (se + (ne - se) * t - slope * s, slope)
         });
         let south = plane(sw, se, m, |sw, se, m| (sw + (m - f64::midpoint(sw, se)) * 2.0 * t, (se - sw) / s));
-        let north = plane(nw, ne, m, |nw, ne, m| (nw + (m - f64::midpoint(nw, ne)) * 2.0 * (1.0 - t), (ne - nw) / s));
+        let north =
+            plane(nw, ne, m, |nw, ne, m| (nw + (m - f64::midpoint(nw, ne)) * 2.0 * (1.0 - t), (ne - nw) / s));
         let lower = dy <= half;
-        let (d_west, d_east) = if lower { (edges(sw, m), edges(se, m)) } else { (edges(nw, m), edges(ne, m)) };
+        let (d_west, d_east) =
+            if lower { (edges(sw, m), edges(se, m)) } else { (edges(nw, m), edges(ne, m)) };
         run(samples, cell, dy, [0, near], west, [edges(sw, nw), d_west], false, &mut local[of_quarter[3]]);
-        run(samples, cell, dy, [side - near, side], east, [d_east, edges(se, ne)], false, &mut local[of_quarter[1]]);
+        run(
+            samples,
+            cell,
+            dy,
+            [side - near, side],
+            east,
+            [d_east, edges(se, ne)],
+            false,
+            &mut local[of_quarter[1]],
+        );
         if lower {
             let flat = dy == 0 && edges(sw, se);
-            run(samples, cell, dy, [near, side - near], south, [d_west, d_east], flat, &mut local[of_quarter[0]]);
+            run(
+                samples,
+                cell,
+                dy,
+                [near, side - near],
+                south,
+                [d_west, d_east],
+                flat,
+                &mut local[of_quarter[0]],
+            );
         }
         if dy >= half {
             let flat = dy == side && edges(nw, ne);
-            run(samples, cell, dy, [near, side - near], north, [d_west, d_east], flat, &mut local[of_quarter[2]]);
+            run(
+                samples,
+                cell,
+                dy,
+                [near, side - near],
+                north,
+                [d_west, d_east],
+                flat,
+                &mut local[of_quarter[2]],
+            );
         }
     }
 }
 
 /// Start and slope along a row, if all three corners have a height.
-fn plane(a: Option<f64>, b: Option<f64>, c: Option<f64>, f: impl Fn(f64, f64, f64) -> (f64, f64)) -> Option<(f64, f64)> {
+fn plane(
+    a: Option<f64>,
+    b: Option<f64>,
+    c: Option<f64>,
+    f: impl Fn(f64, f64, f64) -> (f64, f64),
+) -> Option<(f64, f64)> {
     Some(f(a?, b?, c?))
 }
 
@@ -198,8 +249,20 @@ fn plane(a: Option<f64>, b: Option<f64>, c: Option<f64>, f: impl Fn(f64, f64, f6
 /// Where nothing is drawn, a sample with a height is missing, unless it lies on an edge whose ends both
 /// have heights (`ends`: the edges met at either end of the run; `flat`: the row itself is one): that
 /// edge is another triangle's too, and what is missing there is missing inside as well.
-#[allow(clippy::too_many_arguments, reason = "the inner loop of the measurement; a struct would be built a million times")]
-fn run(samples: Samples<'_>, cell: Square, dy: u32, dx: [u32; 2], drawn: Option<(f64, f64)>, ends: [bool; 2], flat: bool, found: &mut Found) {
+#[allow(
+    clippy::too_many_arguments,
+    reason = "the inner loop of the measurement; a struct would be built a million times"
+)]
+fn run(
+    samples: Samples<'_>,
+    cell: Square,
+    dy: u32,
+    dx: [u32; 2],
+    drawn: Option<(f64, f64)>,
+    ends: [bool; 2],
+    flat: bool,
+    found: &mut Found,
+) {
     let clip = samples.clip(0, cell.x, cell.side);
     let (from, to) = (dx[0].max(clip[0]), dx[1].min(clip[1]));
     if from > to {

@@ -31,7 +31,8 @@ impl Progress {
         tracing::info!(stage = name, samples, "building");
         if self.shown {
             let template = "{msg:8} {wide_bar} {percent:>3}% {per_sec} samples, {eta} left";
-            let style = ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
+            let style =
+                ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
             *bar = ProgressBar::new(samples).with_style(style).with_message(name);
         }
     }

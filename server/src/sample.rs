@@ -22,7 +22,9 @@ const CORNER: [f64; 2] = [620_000.0, 7_990_000.0];
 
 /// A number in -1..1 for a point of the noise lattice.
 fn hash(x: i32, y: i32, seed: u32) -> f64 {
-    let mut v = x.cast_unsigned().wrapping_mul(0x9E37_79B1) ^ y.cast_unsigned().wrapping_mul(0x85EB_CA6B) ^ seed.wrapping_mul(0xC2B2_AE35);
+    let mut v = x.cast_unsigned().wrapping_mul(0x9E37_79B1)
+        ^ y.cast_unsigned().wrapping_mul(0x85EB_CA6B)
+        ^ seed.wrapping_mul(0xC2B2_AE35);
     v ^= v >> 16;
     v = v.wrapping_mul(0x7FEB_352D);
     v ^= v >> 15;
@@ -49,7 +51,9 @@ fn noise(x: f64, y: f64, seed: u32) -> f64 {
 
 /// Octaves of noise, each half as wide and half as high.
 fn hills(x: f64, y: f64, octaves: u32, seed: u32) -> f64 {
-    (0..octaves).map(|o| noise(x * f64::from(1 << o), y * f64::from(1 << o), seed + o) / f64::from(1 << o)).sum()
+    (0..octaves)
+        .map(|o| noise(x * f64::from(1 << o), y * f64::from(1 << o), seed + o) / f64::from(1 << o))
+        .sum()
 }
 
 /// Ridges (Musgrave 1994): sharp where noise crosses zero, and detailed only where it is high already, so
@@ -96,7 +100,9 @@ pub fn height(east: f64, north: f64) -> Option<f32> {
 pub fn write(path: &Path, samples: u32) -> Result<(), String> {
     let failed = |e: &dyn std::fmt::Display| format!("{}: cannot write the sample DEM: {e}", path.display());
     let file = BufWriter::new(File::create(path).map_err(|e| failed(&e))?);
-    let mut encoder = TiffEncoder::new(file).map_err(|e| failed(&e))?.with_compression(tiff::encoder::Compression::Deflate(tiff::encoder::DeflateLevel::Fast));
+    let mut encoder = TiffEncoder::new(file)
+        .map_err(|e| failed(&e))?
+        .with_compression(tiff::encoder::Compression::Deflate(tiff::encoder::DeflateLevel::Fast));
     let mut image = encoder.new_image::<colortype::Gray32Float>(samples, samples).map_err(|e| failed(&e))?;
     let scale: &[f64] = &[CELL, CELL, 0.0];
     let tie: &[f64] = &[0.0, 0.0, 0.0, CORNER[0], CORNER[1], 0.0];
@@ -125,7 +131,8 @@ pub fn write(path: &Path, samples: u32) -> Result<(), String> {
     image.finish().map_err(|e| failed(&e))
 }
 
-type Image<'a> = tiff::encoder::ImageEncoder<'a, BufWriter<File>, colortype::Gray32Float, tiff::encoder::TiffKindStandard>;
+type Image<'a> =
+    tiff::encoder::ImageEncoder<'a, BufWriter<File>, colortype::Gray32Float, tiff::encoder::TiffKindStandard>;
 
 /// A tag of any type.
 trait WriteTag {

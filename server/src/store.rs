@@ -89,7 +89,9 @@ pub enum StoreError {
         error: io::Error,
     },
     /// There is no store here.
-    #[error("{0}: not a store: expected a folder with a {SCENE_FILE} in it; build one with `diamantina-server build DEM -o {0}`")]
+    #[error(
+        "{0}: not a store: expected a folder with a {SCENE_FILE} in it; build one with `diamantina-server build DEM -o {0}`"
+    )]
     NotAStore(PathBuf),
     /// Another build holds the lock.
     #[error("{0}: another build is writing this store: wait for it, or choose another folder with -o")]
@@ -114,7 +116,9 @@ pub enum StoreError {
 
 fn remedy(error: &io::Error) -> &'static str {
     match error.kind() {
-        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => "; free some space and build again (the old scene, if any, is untouched)",
+        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
+            "; free some space and build again (the old scene, if any, is untouched)"
+        }
         io::ErrorKind::PermissionDenied => "; choose a folder that you may write to",
         io::ErrorKind::ReadOnlyFilesystem => "; choose a folder on a disk that can be written",
         _ => "",
@@ -240,7 +244,11 @@ impl Writer {
     pub fn create(root: &Path) -> Result<Self, StoreError> {
         fs::create_dir_all(root).map_err(io_at("create the folder", root))?;
         let lock_path = root.join(".lock");
-        let lock = File::options().create(true).append(true).open(&lock_path).map_err(io_at("create", &lock_path))?;
+        let lock = File::options()
+            .create(true)
+            .append(true)
+            .open(&lock_path)
+            .map_err(io_at("create", &lock_path))?;
         match lock.try_lock() {
             Ok(()) => {}
             Err(fs::TryLockError::WouldBlock) => return Err(StoreError::Busy(root.to_owned())),
@@ -249,7 +257,9 @@ impl Writer {
         let work = root.join(WORK_FOLDER);
         // Whoever left this behind is gone, since the lock was free.
         match fs::remove_dir_all(&work) {
-            Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(io_at("remove the leftovers in", &work)(e)),
+            Err(e) if e.kind() != io::ErrorKind::NotFound => {
+                return Err(io_at("remove the leftovers in", &work)(e));
+            }
             _ => {}
         }
         fs::create_dir(&work).map_err(io_at("create the folder", &work))?;
@@ -319,7 +329,9 @@ impl Writer {
         let current = self.root.join(SCENE_FILE);
         fs::rename(&fresh, &current).map_err(io_at("publish", &current))?;
         sync_folder(&self.root)?;
-        if let Some(older) = older.filter(|v| *v != manifest.scene.version && diamantina_protocol::message::is_name(v)) {
+        if let Some(older) =
+            older.filter(|v| *v != manifest.scene.version && diamantina_protocol::message::is_name(v))
+        {
             // A server that has it open keeps its files; who cannot remove it only keeps some bytes more.
             let _ = fs::remove_dir_all(self.root.join(older));
         }
@@ -334,7 +346,12 @@ impl Drop for Writer {
 }
 
 /// Copies the blobs, in order, into packs.
-fn lay_packs(spool: &File, spool_path: &Path, blobs: &[Spooled], data: &Path) -> Result<(Vec<(Key, Place)>, Vec<u64>), StoreError> {
+fn lay_packs(
+    spool: &File,
+    spool_path: &Path,
+    blobs: &[Spooled],
+    data: &Path,
+) -> Result<(Vec<(Key, Place)>, Vec<u64>), StoreError> {
     let mut entries = Vec::with_capacity(blobs.len());
     let mut pack_bytes = Vec::new();
     let mut buffer = Vec::new();
@@ -395,7 +412,8 @@ impl Manifest {
         let mut text = Vec::new();
         Read::by_ref(&mut file).take(SCENE_BYTES_MAX).read_to_end(&mut text).map_err(io_at("read", &path))?;
         let damaged = |what: String| StoreError::Damaged { path: path.clone(), what };
-        let value: serde_json::Value = serde_json::from_slice(&text).map_err(|e| damaged(format!("not JSON ({e})")))?;
+        let value: serde_json::Value =
+            serde_json::from_slice(&text).map_err(|e| damaged(format!("not JSON ({e})")))?;
         match value.get("format").and_then(serde_json::Value::as_u64) {
             Some(format) if format == u64::from(FORMAT) => {}
             Some(format) => {
@@ -406,7 +424,11 @@ impl Manifest {
         }
         let manifest: Self = serde_json::from_value(value).map_err(|e| damaged(e.to_string()))?;
         if manifest.version() != manifest.scene.version {
-            return Err(damaged(format!("says version {}, its content has {}", manifest.scene.version, manifest.version())));
+            return Err(damaged(format!(
+                "says version {}, its content has {}",
+                manifest.scene.version,
+                manifest.version()
+            )));
         }
         Ok(manifest)
     }
@@ -474,7 +496,10 @@ impl Store {
         file.read_exact_at(&mut blob, place.offset.into()).map_err(io_at("read", path))?;
         let found = xxh3_64(&blob);
         if found != place.checksum {
-            let what = format!("blob {key:?} at byte {} has checksum {found:016x}, expected {:016x}", place.offset, place.checksum);
+            let what = format!(
+                "blob {key:?} at byte {} has checksum {found:016x}, expected {:016x}",
+                place.offset, place.checksum
+            );
             return Err(StoreError::Damaged { path: path.clone(), what });
         }
         Ok(Some(blob.into()))
