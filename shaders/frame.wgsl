@@ -48,22 +48,22 @@ struct Layer {
 // Metres over which haze thins out to 1/e, going up.
 const HAZE_HEIGHT: f32 = 2500.0;
 
-// The haze between the eye and a point: 0 is none, 1 hides all. Its density falls with height as an
-// exponential, so its integral along the straight line is known.
-fn haze_to(from_eye: vec3<f32>) -> f32 {
+// The haze between the eye and a point `up` metres above it, `distance` metres away: 0 is none, 1 hides
+// all. Its density falls with height as an exponential, so its integral along the straight line is known.
+fn haze_to(up: f32, distance: f32) -> f32 {
     let eye = max(frame.sun.w, 0.0) / HAZE_HEIGHT;
-    let point = max(frame.sun.w + from_eye.z, 0.0) / HAZE_HEIGHT;
+    let point = max(frame.sun.w + up, 0.0) / HAZE_HEIGHT;
     let rise = point - eye;
     var density = exp(-eye);
     if abs(rise) > 1e-3 {
         density = (density - exp(-point)) / rise;
     }
-    return 1.0 - exp(-frame.horizon.w * density * length(from_eye));
+    return 1.0 - exp(-frame.horizon.w * density * distance);
 }
 
 // The light that a surface sends back: the sun, and the sky's half sphere, brighter from above.
 fn lit(albedo: vec3<f32>, normal: vec3<f32>) -> vec3<f32> {
-    let sun = vec3<f32>(1.08, 1.02, 0.92) * max(dot(normal, frame.sun.xyz), 0.0);
+    let sun = vec3<f32>(1.08, 1.04, 0.97) * max(dot(normal, frame.sun.xyz), 0.0);
     let sky = vec3<f32>(0.25, 0.28, 0.34) * (0.5 + 0.5 * normal.z);
     return albedo * (sun + sky);
 }

@@ -14,9 +14,9 @@ struct Vertex {
 
 struct Shaded {
     @builtin(position) @invariant clip: vec4<f32>,
-    @location(0) from_eye: vec3<f32>,
-    @location(1) normal: vec3<f32>,
-    @location(2) level: f32,
+    // xy: the normal's east and north. z: metres up from the eye. w: metres from the eye.
+    @location(0) about: vec4<f32>,
+    @location(1) level: f32,
 }
 
 // Up to the conversion to f32 all is exact, and from there on a function of the lattice point and the
@@ -28,11 +28,9 @@ fn terrain_vertex(vertex: Vertex) -> Shaded {
     let across = vec2<f32>(lattice) * layer.cell + layer.offset;
     let up = f32(vertex.height - layer.height) * layer.quantum + layer.up_offset;
     let from_eye = vec3<f32>(across, up);
-    let normal_up = sqrt(max(1.0 - dot(vertex.normal, vertex.normal), 0.0));
     return Shaded(
         frame.clip_from_eye * vec4<f32>(from_eye, 1.0),
-        from_eye,
-        vec3<f32>(vertex.normal, normal_up),
+        vec4<f32>(vertex.normal, up, length(from_eye)),
         f32(vertex.level.x),
     );
 }
@@ -58,16 +56,20 @@ fn sea_colour(t: f32) -> vec3<f32> {
     return colour;
 }
 
-fn albedo_at(height: f32, normal_up: f32) -> vec3<f32> {
+// `pixel_height`: metres of height from this pixel to the next.
+fn albedo_at(height: f32, pixel_height: f32, normal_up: f32) -> vec3<f32> {
     if frame.options.z != 0.0 {
         return vec3<f32>(0.5);
     }
-    if height < 0.0 && layer.per_depth > 0.0 {
-        return sea_colour(-height * layer.per_depth);
-    }
-    let land = land_colour((height - layer.land_base) * layer.per_height);
     // Rock shows on steep ground.
-    return land * mix(0.7, 1.0, smoothstep(0.45, 0.9, normal_up));
+    let steep = mix(0.7, 1.0, smoothstep(0.45, 0.9, normal_up));
+    let land = steep * land_colour((height - layer.land_base) * layer.per_height);
+    if layer.per_depth == 0.0 {
+        return land;
+    }
+    // The shore is as wide as a pixel, so that it does not flicker.
+    let sea = sea_colour(-height * layer.per_depth);
+    return mix(sea, land, clamp(height / pixel_height + 0.5, 0.0, 1.0));
 }
 
 // Six hues in turn, so that neighbouring levels differ.
@@ -78,10 +80,12 @@ fn level_tint(level: f32) -> vec3<f32> {
 
 @fragment
 fn terrain_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
-    let normal = normalize(shaded.normal);
-    var albedo = albedo_at(frame.sun.w + shaded.from_eye.z, normal.z);
+    let across = shaded.about.xy;
+    let normal = vec3<f32>(across, sqrt(max(1.0 - dot(across, across), 0.0)));
+    let height = frame.sun.w + shaded.about.z;
+    var albedo = albedo_at(height, max(fwidth(height), 1e-6), normal.z);
     if frame.options.y != 0.0 {
         albedo = mix(albedo, level_tint(round(shaded.level)), 0.5);
     }
-    return encoded(mix(lit(albedo, normal), frame.horizon.rgb, haze_to(shaded.from_eye)));
+    return encoded(mix(lit(albedo, normal), frame.horizon.rgb, haze_to(shaded.about.z, shaded.about.w)));
 }

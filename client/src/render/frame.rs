@@ -10,22 +10,22 @@ use crate::camera::Camera;
 use diamantina_protocol::message::Layer;
 use glam::DVec3;
 
-/// Haze of a metre of air at height 0, for a haze of 1: about 6 % at 10 km.
-const HAZE_PER_METRE: f32 = 6e-6;
+/// Haze of a metre of air at height 0, for a haze of 1: 13 % at 10 km.
+const HAZE_PER_METRE: f32 = 1.4e-5;
 
 /// A colour of a ramp: where it stands, and sRGB as 0xRRGGBB.
 type Stop = (f32, u32);
 
 /// Land, lowest to highest: forest green, meadow, straw, ochre, brown, grey, white.
 const LAND: [Stop; 8] = [
-    (0.0, 0x2f_6a_3e),
-    (0.10, 0x55_8a_4a),
-    (0.24, 0x98_a8_5e),
-    (0.40, 0xcb_b3_74),
-    (0.56, 0xb0_87_5b),
-    (0.72, 0x97_85_78),
-    (0.86, 0xbb_b8_b6),
-    (1.0, 0xf6_f8_fa),
+    (0.0, 0x3d_6e_4a),
+    (0.12, 0x62_8d_56),
+    (0.28, 0x9f_ad_6e),
+    (0.44, 0xcd_bd_88),
+    (0.60, 0xb8_9c_78),
+    (0.74, 0xa6_98_8d),
+    (0.87, 0xc8_c6_c5),
+    (1.0, 0xfa_fb_fd),
 ];
 
 /// The sea, shallow to deep.

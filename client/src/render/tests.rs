@@ -389,19 +389,22 @@ fn mountains_look_like_mountains() {
     let low =
         Camera { eye: world.place(0.35, 0.2, 2400.0), target: world.place(0.62, 0.6, 1500.0), ..oblique };
     println!("heights {:?}", world.layer.heights);
-    for (samples, level) in [(4, 8), (1, 8), (1, 7)] {
+    for (samples, level) in [(4, 8), (1, 8), (1, 7), (1, 5)] {
         let mut offscreen = offscreen(samples);
         let items = world.level(level);
         for (name, camera) in [("above", &above), ("oblique", &oblique), ("low", &low)] {
-            for show_levels in [false, true] {
+            for show_levels in [false, true].into_iter().take(if level == 8 { 2 } else { 1 }) {
                 let look = Look { show_levels, ..Look::default() };
-                offscreen.draw(layers, camera, &items, &look).unwrap();
-                offscreen.read().unwrap();
-                let start = std::time::Instant::now();
-                let stats = offscreen.draw(layers, camera, &items, &look).unwrap();
-                let encoded = start.elapsed();
-                let picture = offscreen.read().unwrap();
-                println!("{name} x{samples} {stats:?} {encoded:?} {:?}", start.elapsed());
+                let mut frame = || {
+                    let start = std::time::Instant::now();
+                    let stats = offscreen.draw(layers, camera, &items, &look).unwrap();
+                    let encoded = start.elapsed();
+                    let picture = offscreen.read().unwrap();
+                    (start.elapsed(), encoded, stats, picture)
+                };
+                let frames = (0..8).map(|_| frame());
+                let (whole, encoded, stats, picture) = frames.min_by_key(|f| f.0).unwrap();
+                println!("{name} {samples} samples: {whole:?}, {encoded:?} of it encoding, {stats:?}");
                 let file = format!("diamantina-{name}-{samples}-{level}-{show_levels}.png");
                 let file = std::fs::File::create(std::env::temp_dir().join(file)).unwrap();
                 write_png(&picture, file).unwrap();
