@@ -75,6 +75,7 @@ pub(super) struct Reference {
 impl Reference {
     /// The lattice point and height nearest to the eye, no further than the GPU's integers reach.
     pub(super) fn near(layer: &Layer, eye: DVec3) -> Self {
+        #[allow(clippy::cast_possible_truncation, reason = "clamped just before")]
         let nearest = |value: f64| value.round().clamp(-5e8, 5e8) as i64;
         Self {
             lattice: [0, 1].map(|i| nearest((eye[i] - layer.origin[i]) / layer.cell[i])),
@@ -93,16 +94,16 @@ impl Reference {
         let offset = [0, 1].map(|i| layer.origin[i] + layer.cell[i] * self.lattice[i] as f64 - eye[i]);
         let up_offset = self.height as f64 * layer.quantum + layer.height_offset - eye.z;
         let [lowest, highest] = layer.heights;
-        let inverse = |range: f64| if range > 0.0 { (1.0 / range) as f32 } else { 0.0 };
+        let inverse = |range: f64| if range > 0.0 { single(1.0 / range) } else { 0.0 };
         let land_base = lowest.max(0.0).min(highest);
         LayerUniform {
-            cell: layer.cell.map(|c| c as f32),
-            offset: offset.map(|o| o as f32),
-            quantum: layer.quantum as f32,
-            up_offset: up_offset as f32,
+            cell: layer.cell.map(single),
+            offset: offset.map(single),
+            quantum: single(layer.quantum),
+            up_offset: single(up_offset),
             height: i32::try_from(self.height).unwrap_or(0),
             per_depth: inverse(-lowest),
-            land_base: land_base as f32,
+            land_base: single(land_base),
             per_height: inverse(highest - land_base),
             unused: [0.0; 2],
         }
@@ -127,7 +128,7 @@ impl FrameUniform {
             right: with(right * tan * width / height, 0.0),
             up: with(up * tan, 0.0),
             forward: with(-backward, 0.0),
-            sun: with(look.sun.direction(), camera.eye.z as f32),
+            sun: with(look.sun.direction(), single(camera.eye.z)),
             horizon: colour(HORIZON, look.haze * HAZE_PER_METRE),
             zenith: colour(ZENITH, 0.0),
             options: [flag(encode), flag(look.show_levels), flag(look.colours == Colours::Flat), 0.0],
@@ -135,6 +136,12 @@ impl FrameUniform {
             sea: SEA.map(|(at, srgb)| colour(srgb, at)),
         }
     }
+}
+
+/// What the GPU takes of a number, once all that needs more digits is done.
+#[allow(clippy::cast_possible_truncation, reason = "rounding to f32 is the purpose")]
+pub(super) fn single(value: f64) -> f32 {
+    value as f32
 }
 
 /// Linear red, green and blue of 0xRRGGBB.
@@ -202,10 +209,8 @@ mod tests {
         let layer =
             twin!(LayerUniform: cell offset quantum up_offset height per_depth land_base per_height unused);
         assert_eq!(layout("Layer"), layer);
-        assert!(
-            size_of::<FrameUniform>() % 16 == 0 && size_of::<LayerUniform>() % 16 == 0,
-            "WebGL2 wants it"
-        );
+        let sizes = [size_of::<FrameUniform>(), size_of::<LayerUniform>()];
+        assert!(sizes.iter().all(|s| s.is_multiple_of(16)), "WebGL2 wants it");
     }
 
     #[test]

@@ -24,7 +24,7 @@ pub use offscreen::Offscreen;
 use crate::camera::Camera;
 use crate::drawing::DrawItem;
 use diamantina_protocol::message::Layer;
-use frame::{FrameUniform, LayerUniform, Reference};
+use frame::{FrameUniform, LayerUniform, Reference, single};
 use glam::DVec3;
 use resident::{Residents, SurfacePoint, Triangles};
 use std::ops::Range;
@@ -336,7 +336,7 @@ impl Renderer {
     fn write_uniforms(&mut self, layers: &[Layer], camera: &Camera, look: &Look, draws: &[Draw<'_>]) {
         let nearest = draws.iter().map(|d| d.distance).fold(NEAR_MAX, f64::min);
         // A little before the nearest box: rounding must not cut it.
-        let near = (0.9 * nearest).max(NEAR_MIN) as f32;
+        let near = single((0.9 * nearest).max(NEAR_MIN));
         let frame = FrameUniform::new(camera, look, near, !self.options.format.is_srgb());
         self.queue.write_buffer(&self.frame_uniform, 0, bytemuck::bytes_of(&frame));
 

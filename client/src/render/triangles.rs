@@ -58,11 +58,10 @@ pub(super) fn lists_of(block: &Block) -> Lists {
 
 /// The triangle of the split in which the micro-triangle over `side` of the cell (u, v) lies.
 fn side_of(n: usize, u: usize, v: usize, side: usize) -> usize {
-    // Three times the centroid in doubled coordinates, from the diamond's centre.
-    let toward = [[0, -2], [2, 0], [0, 2], [-2, 0]][side];
-    let centroid = |i: usize, toward: i64| 6 * i as i64 + 3 + toward - 3 * n as i64;
-    let (x, y) = (centroid(u, toward[0]), centroid(v, toward[1]));
-    match (x.abs() > y.abs(), x > 0, y > 0) {
+    // Three times the centroid in doubled coordinates; the diamond's centre is at 3n.
+    let [east, north] = [[3, 1], [5, 3], [3, 5], [1, 3]][side];
+    let (x, y, centre) = (6 * u + east, 6 * v + north, 3 * n);
+    match (x.abs_diff(centre) > y.abs_diff(centre), x > centre, y > centre) {
         (true, true, _) => 1,
         (true, false, _) => 3,
         (false, _, true) => 2,
@@ -126,7 +125,7 @@ mod tests {
             }
         }
         assert!(covered.values().all(|count| *count == 1), "no triangle twice");
-        assert_eq!(covered.len() as i64, 4 * n * n, "areas add up to the square's");
+        assert_eq!(covered.len(), 4 * 8 * 8, "areas add up to the square's");
         // Every inner edge has two triangles, every edge of the square one: so nothing overlaps.
         let mut edges = BTreeMap::new();
         for [a, b, c] in triangles(8).concat() {
@@ -202,7 +201,7 @@ mod tests {
                 _ => p[0] == 0,
             };
             let points: BTreeSet<_> = list.into_iter().flatten().filter(on_side).collect();
-            assert_eq!(points.len() as i64, n + 1);
+            assert_eq!(points.len(), 8 + 1);
             assert!(points.iter().all(|p| p.iter().all(|i| i % 2 == 0)));
         }
     }
