@@ -161,18 +161,40 @@ mod tests {
     const SHADERS: [(&str, &str); 2] =
         [("terrain.wgsl", super::super::TERRAIN_WGSL), ("sky.wgsl", super::super::SKY_WGSL)];
 
+    /// Whatever a browser's WebGL2 takes, the others take too.
+    fn translate(module: &naga::Module, info: &naga::valid::ModuleInfo, entry: &naga::EntryPoint) -> String {
+        use naga::back::glsl;
+        let options = glsl::Options {
+            version: glsl::Version::Embedded { version: 300, is_webgl: true },
+            ..Default::default()
+        };
+        let pipeline = glsl::PipelineOptions {
+            shader_stage: entry.stage,
+            entry_point: entry.name.clone(),
+            multiview: None,
+        };
+        let mut text = String::new();
+        let policies = naga::proc::BoundsCheckPolicies::default();
+        let mut writer = glsl::Writer::new(&mut text, module, info, &options, &pipeline, policies).unwrap();
+        writer.write().unwrap();
+        text
+    }
+
     #[test]
-    fn every_shader_is_valid() {
+    fn every_shader_is_valid_and_fit_for_webgl2() {
         for (name, source) in SHADERS {
             let module = naga::front::wgsl::parse_str(source)
                 .unwrap_or_else(|e| panic!("{}", e.emit_to_string_with_path(source, name)));
             // No capabilities: what any device has, browsers included.
-            naga::valid::Validator::new(
-                naga::valid::ValidationFlags::all(),
-                naga::valid::Capabilities::empty(),
-            )
-            .validate(&module)
-            .unwrap_or_else(|e| panic!("{}", e.emit_to_string_with_path(source, name)));
+            let (flags, capabilities) =
+                (naga::valid::ValidationFlags::all(), naga::valid::Capabilities::empty());
+            let info = naga::valid::Validator::new(flags, capabilities)
+                .validate(&module)
+                .unwrap_or_else(|e| panic!("{}", e.emit_to_string_with_path(source, name)));
+            assert_eq!(module.entry_points.len(), 2, "{name}");
+            for entry in &module.entry_points {
+                assert!(translate(&module, &info, entry).contains("#version 300 es"));
+            }
         }
     }
 

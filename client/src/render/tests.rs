@@ -143,12 +143,13 @@ impl World {
     }
 }
 
-fn offscreen(samples: u32) -> Offscreen {
-    Offscreen::new(&Options { samples, ..Options::default() }).unwrap_or_else(|e| panic!("{e}"))
+fn offscreen(samples: u32, budget_bytes: u64) -> Offscreen {
+    let options = Options { samples, budget_bytes, ..Options::default() };
+    Offscreen::new(&options).unwrap_or_else(|e| panic!("{e}"))
 }
 
 fn picture(world: &World, camera: &Camera, items: &[DrawItem], look: &Look) -> Picture {
-    let mut offscreen = offscreen(1);
+    let mut offscreen = offscreen(1, 1 << 30);
     offscreen.draw(std::slice::from_ref(&world.layer), camera, items, look).unwrap();
     offscreen.read().unwrap()
 }
@@ -330,7 +331,7 @@ fn surfaces_are_uploaded_once_and_dropped_over_budget() {
     let (coarse, fine) = (world.level(1), world.level(6));
     let one = (5 * 5 + 4 * 4) * 8;
     let budget_bytes = one * (fine.len() as u64);
-    let mut offscreen = Offscreen::new(&Options { samples: 1, budget_bytes, ..Options::default() }).unwrap();
+    let mut offscreen = offscreen(1, budget_bytes);
     let stats = offscreen.draw(layers, &camera, &coarse, &PLAIN).unwrap();
     assert_eq!(stats, FrameStats { triangles: 64, draws: 1, uploaded_bytes: one, gpu_bytes: one });
     assert_eq!(offscreen.draw(layers, &camera, &coarse, &PLAIN).unwrap().uploaded_bytes, 0);
@@ -349,7 +350,7 @@ fn surfaces_are_uploaded_once_and_dropped_over_budget() {
 #[test]
 fn sizes_and_unknown_layers_are_refused() {
     let world = World::new(Forest::new(4, 2, [1, 1]).unwrap(), 30.0, rough);
-    let mut offscreen = offscreen(4);
+    let mut offscreen = offscreen(4, 1 << 30);
     let empty = Camera { size: [0, 4], ..world.overhead([4, 4]) };
     let result = offscreen.draw(&[], &empty, &[], &PLAIN);
     assert!(matches!(result, Err(RenderError::Size { found: [0, 4], .. })));
@@ -397,7 +398,7 @@ fn mountains_look_like_mountains() {
         Camera { eye: world.place(0.35, 0.2, 2400.0), target: world.place(0.62, 0.6, 1500.0), ..oblique };
     println!("heights {:?}", world.layer.heights);
     for (samples, level) in [(4, 8), (1, 8), (1, 7), (1, 5)] {
-        let mut offscreen = offscreen(samples);
+        let mut offscreen = offscreen(samples, 1 << 30);
         let items = world.level(level);
         for (name, camera) in [("above", &above), ("oblique", &oblique), ("low", &low)] {
             for show_levels in [false, true].into_iter().take(if level == 8 { 2 } else { 1 }) {
