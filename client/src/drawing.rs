@@ -1,0 +1,19 @@
+//! What one frame draws, as plain data: the cut writes it, the renderer reads it.
+
+use crate::surface::Surface;
+use diamantina_protocol::diamond::Diamond;
+use std::sync::Arc;
+
+/// One diamond to draw in a frame: some of the four triangles of its split.
+#[derive(Debug, Clone)]
+pub struct DrawItem {
+    /// Index of the layer in the scene.
+    pub layer: usize,
+    /// The diamond that is split.
+    pub diamond: Diamond,
+    /// The geometry of its split.
+    pub surface: Arc<Surface>,
+    /// Bit q: draw the triangle whose hypotenuse is side q of the diamond's local grid and whose apex is
+    /// its centre.
+    pub sides: u8,
+}

@@ -1,0 +1,250 @@
+//! The uniforms of a frame: twins of the structs in `shaders/frame.wgsl`.
+//!
+//! **Exact where diamonds meet.** The GPU gets lattice coordinates and heights as integers, and the
+//! offset of the eye from a *reference point* of the lattice near it. Integer differences are exact, and
+//! what follows is the same for all diamonds of a layer: a shared point has the same bits in each.
+//! Near the eye the differences are small, so `f32` holds them to a millionth of a cell.
+
+use super::{Colours, Look};
+use crate::camera::Camera;
+use diamantina_protocol::message::Layer;
+use glam::DVec3;
+
+/// Haze of a metre of air at height 0, for a haze of 1: 13 % at 10 km.
+const HAZE_PER_METRE: f32 = 1.4e-5;
+
+/// A colour of a ramp: where it stands, and sRGB as 0xRRGGBB.
+type Stop = (f32, u32);
+
+/// Land, lowest to highest: forest green, meadow, straw, ochre, brown, grey, white.
+const LAND: [Stop; 8] = [
+    (0.0, 0x3d_6e_4a),
+    (0.12, 0x62_8d_56),
+    (0.28, 0x9f_ad_6e),
+    (0.44, 0xcd_bd_88),
+    (0.60, 0xb8_9c_78),
+    (0.74, 0xa6_98_8d),
+    (0.87, 0xc8_c6_c5),
+    (1.0, 0xfa_fb_fd),
+];
+
+/// The sea, shallow to deep.
+const SEA: [Stop; 4] = [(0.0, 0xa9_d6_dd), (0.12, 0x62_ad_cc), (0.45, 0x2a_6c_a0), (1.0, 0x12_2f_5c)];
+
+const HORIZON: u32 = 0xd3_e0_ec;
+const ZENITH: u32 = 0x4f_80_bd;
+
+/// The twin of `Frame`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+pub(super) struct FrameUniform {
+    clip_from_eye: [[f32; 4]; 4],
+    right: [f32; 4],
+    up: [f32; 4],
+    forward: [f32; 4],
+    sun: [f32; 4],
+    horizon: [f32; 4],
+    zenith: [f32; 4],
+    options: [f32; 4],
+    land: [[f32; 4]; 8],
+    sea: [[f32; 4]; 4],
+}
+
+/// The twin of `Layer`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+pub(super) struct LayerUniform {
+    cell: [f32; 2],
+    offset: [f32; 2],
+    quantum: f32,
+    up_offset: f32,
+    height: i32,
+    per_depth: f32,
+    land_base: f32,
+    per_height: f32,
+    unused: [f32; 2],
+}
+
+/// Where the eye is in a layer: the lattice point that positions are relative to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Reference {
+    lattice: [i64; 2],
+    height: i64,
+}
+
+impl Reference {
+    /// The lattice point and height nearest to the eye, no further than the GPU's integers reach.
+    pub(super) fn near(layer: &Layer, eye: DVec3) -> Self {
+        #[allow(clippy::cast_possible_truncation, reason = "clamped just before")]
+        let nearest = |value: f64| value.round().clamp(-5e8, 5e8) as i64;
+        Self {
+            lattice: [0, 1].map(|i| nearest((eye[i] - layer.origin[i]) / layer.cell[i])),
+            height: nearest((eye.z - layer.height_offset) / layer.quantum),
+        }
+    }
+
+    /// A lattice point relative to the reference point.
+    pub(super) fn relative(&self, [x, y]: [i64; 2]) -> [i32; 2] {
+        // Both are below 2^29 in magnitude.
+        [x - self.lattice[0], y - self.lattice[1]].map(|d| i32::try_from(d).unwrap_or(i32::MAX))
+    }
+
+    /// The layer's uniforms.
+    pub(super) fn uniform(&self, layer: &Layer, eye: DVec3) -> LayerUniform {
+        let offset = [0, 1].map(|i| layer.origin[i] + layer.cell[i] * self.lattice[i] as f64 - eye[i]);
+        let up_offset = self.height as f64 * layer.quantum + layer.height_offset - eye.z;
+        let [lowest, highest] = layer.heights;
+        let inverse = |range: f64| if range > 0.0 { single(1.0 / range) } else { 0.0 };
+        let land_base = lowest.max(0.0).min(highest);
+        LayerUniform {
+            cell: layer.cell.map(single),
+            offset: offset.map(single),
+            quantum: single(layer.quantum),
+            up_offset: single(up_offset),
+            height: i32::try_from(self.height).unwrap_or(0),
+            per_depth: inverse(-lowest),
+            land_base: single(land_base),
+            per_height: inverse(highest - land_base),
+            unused: [0.0; 2],
+        }
+    }
+}
+
+impl FrameUniform {
+    /// The uniforms of a frame. `encode`: whether the target stores colours as they are, so that the
+    /// shader must encode sRGB. `near`: the near plane, in metres.
+    pub(super) fn new(camera: &Camera, look: &Look, near: f32, encode: bool) -> Self {
+        let [right, up, backward] = camera.axes();
+        let tan = (camera.fov_y / 2.0).tan();
+        let [width, height] = camera.size.map(|s| f64::from(s.max(1)));
+        let with = |v: DVec3, w: f32| v.as_vec3().extend(w).to_array();
+        let colour = |srgb: u32, w: f32| {
+            let [r, g, b] = linear(srgb);
+            [r, g, b, w]
+        };
+        let flag = |on: bool| f32::from(u8::from(on));
+        Self {
+            clip_from_eye: camera.clip_from_eye(near).to_cols_array_2d(),
+            right: with(right * tan * width / height, 0.0),
+            up: with(up * tan, 0.0),
+            forward: with(-backward, 0.0),
+            sun: with(look.sun.direction(), single(camera.eye.z)),
+            horizon: colour(HORIZON, look.haze * HAZE_PER_METRE),
+            zenith: colour(ZENITH, 0.0),
+            options: [flag(encode), flag(look.show_levels), flag(look.colours == Colours::Flat), 0.0],
+            land: LAND.map(|(at, srgb)| colour(srgb, at)),
+            sea: SEA.map(|(at, srgb)| colour(srgb, at)),
+        }
+    }
+}
+
+/// What the GPU takes of a number, once all that needs more digits is done.
+#[allow(clippy::cast_possible_truncation, reason = "rounding to f32 is the purpose")]
+pub(super) fn single(value: f64) -> f32 {
+    value as f32
+}
+
+/// Linear red, green and blue of 0xRRGGBB.
+fn linear(srgb: u32) -> [f32; 3] {
+    let [_, r, g, b] = srgb.to_be_bytes();
+    [r, g, b].map(|byte| {
+        let c = f32::from(byte) / 255.0;
+        if c <= 0.040_45 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::mem::offset_of;
+
+    const SHADERS: [(&str, &str); 2] =
+        [("terrain.wgsl", super::super::TERRAIN_WGSL), ("sky.wgsl", super::super::SKY_WGSL)];
+
+    /// Whatever a browser's WebGL2 takes, the others take too.
+    fn translate(module: &naga::Module, info: &naga::valid::ModuleInfo, entry: &naga::EntryPoint) -> String {
+        use naga::back::glsl;
+        let options = glsl::Options {
+            version: glsl::Version::Embedded { version: 300, is_webgl: true },
+            ..Default::default()
+        };
+        let pipeline = glsl::PipelineOptions {
+            shader_stage: entry.stage,
+            entry_point: entry.name.clone(),
+            multiview: None,
+        };
+        let mut text = String::new();
+        let policies = naga::proc::BoundsCheckPolicies::default();
+        let mut writer = glsl::Writer::new(&mut text, module, info, &options, &pipeline, policies).unwrap();
+        writer.write().unwrap();
+        text
+    }
+
+    #[test]
+    fn every_shader_is_valid_and_fit_for_webgl2() {
+        for (name, source) in SHADERS {
+            let module = naga::front::wgsl::parse_str(source)
+                .unwrap_or_else(|e| panic!("{}", e.emit_to_string_with_path(source, name)));
+            // No capabilities: what any device has, browsers included.
+            let (flags, capabilities) =
+                (naga::valid::ValidationFlags::all(), naga::valid::Capabilities::empty());
+            let info = naga::valid::Validator::new(flags, capabilities)
+                .validate(&module)
+                .unwrap_or_else(|e| panic!("{}", e.emit_to_string_with_path(source, name)));
+            assert_eq!(module.entry_points.len(), 2, "{name}");
+            for entry in &module.entry_points {
+                assert!(translate(&module, &info, entry).contains("#version 300 es"));
+            }
+        }
+    }
+
+    #[test]
+    fn every_file_of_shaders_is_tested() {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../shaders");
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let name = entry.unwrap().file_name().into_string().unwrap();
+            assert!(name == "frame.wgsl" || SHADERS.iter().any(|(n, _)| *n == name), "{name}");
+        }
+    }
+
+    /// Name, offset and, last, the size of the whole.
+    fn layout(name: &str) -> Vec<(String, usize)> {
+        let module = naga::front::wgsl::parse_str(super::super::TERRAIN_WGSL).unwrap();
+        let (_, found) = module.types.iter().find(|(_, t)| t.name.as_deref() == Some(name)).unwrap();
+        let naga::TypeInner::Struct { members, span } = &found.inner else { panic!("{name} is no struct") };
+        let mut layout: Vec<_> =
+            members.iter().map(|m| (m.name.clone().unwrap(), m.offset as usize)).collect();
+        layout.push(("size".into(), *span as usize));
+        layout
+    }
+
+    macro_rules! twin {
+        ($type:ty: $($field:ident)*) => {
+            vec![$((stringify!($field).to_owned(), offset_of!($type, $field)),)* ("size".into(), size_of::<$type>())]
+        };
+    }
+
+    #[test]
+    fn uniforms_have_the_layout_of_their_twins() {
+        let frame = twin!(FrameUniform: clip_from_eye right up forward sun horizon zenith options land sea);
+        assert_eq!(layout("Frame"), frame);
+        let layer =
+            twin!(LayerUniform: cell offset quantum up_offset height per_depth land_base per_height unused);
+        assert_eq!(layout("Layer"), layer);
+        let sizes = [size_of::<FrameUniform>(), size_of::<LayerUniform>()];
+        assert!(sizes.iter().all(|s| s.is_multiple_of(16)), "WebGL2 wants it");
+    }
+
+    #[test]
+    fn colours_are_linear() {
+        assert_eq!(linear(0xff_00_ff), [1.0, 0.0, 1.0]);
+        assert!((linear(0x80_80_80)[0] - 0.215_86).abs() < 1e-4);
+    }
+
+    #[test]
+    fn stops_rise() {
+        for ramp in [&LAND[..], &SEA[..]] {
+            assert!(ramp.is_sorted_by(|a, b| a.0 < b.0));
+        }
+    }
+}

@@ -1,0 +1,607 @@
+//! Diamonds and a camera → a picture. The only module, with the fronts, that knows wgpu.
+//!
+//! | module | what it holds |
+//! |---|---|
+//! | `frame` | the uniforms, and how positions stay exact far from the origin |
+//! | `triangles` | which points of a diamond make its triangles |
+//! | `resident` | surfaces on the GPU, under a budget |
+//! | `offscreen` | pictures without a window |
+//!
+//! A diamond is one or two draws: its points at their own buffer, its place and axes as an instance, the
+//! index lists shared by all. Nothing is used that WebGL2 lacks: no storage buffers, no base vertex, no
+//! indirect draws. Depth is reversed and infinite, positions are relative to the eye.
+
+mod frame;
+mod offscreen;
+mod resident;
+mod triangles;
+
+#[cfg(test)]
+mod tests;
+
+pub use offscreen::Offscreen;
+
+use crate::camera::Camera;
+use crate::drawing::DrawItem;
+use diamantina_protocol::message::Layer;
+use frame::{FrameUniform, LayerUniform, Reference, single};
+use glam::DVec3;
+use resident::{Residents, SurfacePoint, Triangles};
+use std::ops::Range;
+
+const TERRAIN_WGSL: &str =
+    concat!(include_str!("../../../shaders/frame.wgsl"), include_str!("../../../shaders/terrain.wgsl"));
+const SKY_WGSL: &str =
+    concat!(include_str!("../../../shaders/frame.wgsl"), include_str!("../../../shaders/sky.wgsl"));
+
+const DEPTH: wgpu::TextureFormat = wgpu::TextureFormat::Depth32Float;
+
+/// Bytes from one layer's uniforms to the next: the largest alignment that WebGPU and WebGL2 ask for.
+const LAYER_STRIDE: usize = 256;
+
+/// The nearest that the near plane comes to the eye, in metres.
+const NEAR_MIN: f64 = 0.05;
+
+/// The farthest that the near plane goes, in metres, whatever lies beyond.
+const NEAR_MAX: f64 = 1e6;
+
+/// What a renderer is made for, once and for all.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Options {
+    /// The format of the views drawn to. If it is not an sRGB format, the shader encodes sRGB.
+    pub format: wgpu::TextureFormat,
+    /// Samples a pixel: 1, or 4 to smooth edges.
+    pub samples: u32,
+    /// Bytes of GPU memory for surfaces; those that a frame draws are kept whatever they take.
+    pub budget_bytes: u64,
+}
+
+impl Default for Options {
+    /// Four samples, 512 MiB: about eight thousand diamonds of 64 segments.
+    fn default() -> Self {
+        Self { format: wgpu::TextureFormat::Rgba8UnormSrgb, samples: 4, budget_bytes: 512 << 20 }
+    }
+}
+
+/// How a frame looks.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Look {
+    /// What is seen where no terrain is.
+    pub background: Background,
+    /// Where the light comes from.
+    pub sun: Sun,
+    /// What terrain is coloured by.
+    pub colours: Colours,
+    /// The thickness of the air: 0 is none, 1 a clear day.
+    pub haze: f32,
+    /// Whether to tint diamonds by level.
+    pub show_levels: bool,
+}
+
+impl Default for Look {
+    fn default() -> Self {
+        Self {
+            background: Background::Sky,
+            sun: Sun::default(),
+            colours: Colours::Hypsometric,
+            haze: 1.0,
+            show_levels: false,
+        }
+    }
+}
+
+/// What is seen where no terrain is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Background {
+    /// A gradient from the horizon to overhead.
+    Sky,
+    /// One colour: linear red, green, blue and alpha.
+    Colour([f32; 4]),
+}
+
+/// The direction to the sun.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sun {
+    /// Degrees from north, clockwise.
+    pub azimuth_degrees: f64,
+    /// Degrees above the horizon.
+    pub altitude_degrees: f64,
+}
+
+impl Default for Sun {
+    /// North-west and half way up: the custom of maps, which makes valleys look like valleys.
+    fn default() -> Self {
+        Self { azimuth_degrees: 315.0, altitude_degrees: 45.0 }
+    }
+}
+
+impl Sun {
+    /// The unit vector towards the sun: x east, y north, z up.
+    #[must_use]
+    pub fn direction(self) -> DVec3 {
+        let (azimuth, altitude) = (self.azimuth_degrees.to_radians(), self.altitude_degrees.to_radians());
+        DVec3::new(azimuth.sin() * altitude.cos(), azimuth.cos() * altitude.cos(), altitude.sin())
+    }
+}
+
+/// What terrain is coloured by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Colours {
+    /// Height, over the layer's range; below 0 m, depth.
+    Hypsometric,
+    /// Nothing: one grey.
+    Flat,
+}
+
+/// What a frame cost.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct FrameStats {
+    /// Triangles sent to the GPU.
+    pub triangles: u64,
+    /// Draw calls.
+    pub draws: u32,
+    /// Bytes of surfaces uploaded for this frame.
+    pub uploaded_bytes: u64,
+    /// Bytes of GPU memory that surfaces take.
+    pub gpu_bytes: u64,
+}
+
+/// Why there is no picture.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum RenderError {
+    /// The machine has no graphics driver that fits.
+    #[error(
+        "no graphics adapter ({0}): install a Vulkan driver, for example the software one of the Debian \
+         package mesa-vulkan-drivers"
+    )]
+    NoAdapter(String),
+    /// The adapter refused.
+    #[error("the graphics adapter gives no device: {0}")]
+    Device(String),
+    /// A size that cannot be drawn.
+    #[error("picture of {} x {} pixels: expected 1 to {limit} each way", found[0], found[1])]
+    Size {
+        /// The size asked for.
+        found: [u32; 2],
+        /// The adapter's limit.
+        limit: u32,
+    },
+    /// The picture was drawn but did not come back.
+    #[error("the picture could not be read back from the graphics adapter: {0}")]
+    Read(String),
+}
+
+/// A diamond's place, as the vertex shader takes it.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+struct Instance {
+    origin: [i32; 2],
+    axes: [i32; 4],
+    level: [i32; 2],
+}
+
+/// A draw: an item of the frame that is in view.
+struct Draw<'a> {
+    item: &'a DrawItem,
+    sides: u8,
+    shares_triangles: bool,
+    distance: f64,
+}
+
+/// Draws frames to views that the caller owns.
+pub struct Renderer {
+    device: wgpu::Device,
+    queue: wgpu::Queue,
+    options: Options,
+    residents: Residents,
+    terrain: wgpu::RenderPipeline,
+    sky: wgpu::RenderPipeline,
+    frame_group: wgpu::BindGroup,
+    frame_uniform: wgpu::Buffer,
+    layer_layout: wgpu::BindGroupLayout,
+    layers: Option<(wgpu::Buffer, wgpu::BindGroup)>,
+    instances: Option<wgpu::Buffer>,
+    attachments: Option<Attachments>,
+}
+
+/// The textures of a frame besides the target.
+struct Attachments {
+    size: [u32; 2],
+    depth: wgpu::TextureView,
+    /// The target of several samples a pixel, if there are.
+    colour: Option<wgpu::TextureView>,
+}
+
+impl Renderer {
+    /// A renderer on a device that the caller made. Needs no features, and no limits beyond WebGL2's.
+    #[must_use]
+    pub fn new(device: wgpu::Device, queue: wgpu::Queue, options: &Options) -> Self {
+        let layout = |label, dynamic, size: usize| {
+            device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+                label: Some(label),
+                entries: &[wgpu::BindGroupLayoutEntry {
+                    binding: 0,
+                    visibility: wgpu::ShaderStages::VERTEX_FRAGMENT,
+                    ty: wgpu::BindingType::Buffer {
+                        ty: wgpu::BufferBindingType::Uniform,
+                        has_dynamic_offset: dynamic,
+                        min_binding_size: wgpu::BufferSize::new(size as u64),
+                    },
+                    count: None,
+                }],
+            })
+        };
+        let frame_layout = layout("frame", false, size_of::<FrameUniform>());
+        let layer_layout = layout("layer", true, size_of::<LayerUniform>());
+        let frame_uniform = device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("frame"),
+            size: size_of::<FrameUniform>() as u64,
+            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        let frame_group = device.create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some("frame"),
+            layout: &frame_layout,
+            entries: &[wgpu::BindGroupEntry { binding: 0, resource: frame_uniform.as_entire_binding() }],
+        });
+        let terrain = terrain_pipeline(&device, options, &[Some(&frame_layout), Some(&layer_layout)]);
+        let sky = sky_pipeline(&device, options, &[Some(&frame_layout)]);
+        Self {
+            residents: Residents::new(options.budget_bytes),
+            options: *options,
+            terrain,
+            sky,
+            frame_group,
+            frame_uniform,
+            layer_layout,
+            layers: None,
+            instances: None,
+            attachments: None,
+            device,
+            queue,
+        }
+    }
+
+    /// The device that frames are drawn on.
+    #[must_use]
+    pub fn device(&self) -> &wgpu::Device {
+        &self.device
+    }
+
+    /// The queue that frames are sent to.
+    #[must_use]
+    pub fn queue(&self) -> &wgpu::Queue {
+        &self.queue
+    }
+
+    /// Draws a frame to `view`, which is of `camera.size` pixels and of the format of the options, and
+    /// sends it to the GPU; does not wait for it. Surfaces not seen before are uploaded.
+    ///
+    /// Items whose layer is not in `layers`, or whose surface is of another number of segments than the
+    /// layer's, are passed over.
+    pub fn draw(
+        &mut self,
+        layers: &[Layer],
+        camera: &Camera,
+        items: &[DrawItem],
+        look: &Look,
+        view: &wgpu::TextureView,
+    ) -> FrameStats {
+        let uploaded_bytes = self.residents.start_frame(&self.device, layers, items);
+        let draws = self.in_view(layers, camera, items);
+        self.write_uniforms(layers, camera, look, &draws);
+        let attachments = match self.attachments.take() {
+            Some(old) if old.size == camera.size => old,
+            _ => Attachments::new(&self.device, &self.options, camera.size),
+        };
+        let mut stats =
+            FrameStats { uploaded_bytes, gpu_bytes: self.residents.bytes(), ..Default::default() };
+        let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        {
+            let mut pass = begin_pass(&mut encoder, &attachments, view, look, self.options.format);
+            self.draw_terrain(&mut pass, layers, &draws, &mut stats);
+            if look.background == Background::Sky {
+                pass.set_pipeline(&self.sky);
+                pass.set_bind_group(0, &self.frame_group, &[]);
+                pass.draw(0..3, 0..1);
+            }
+        }
+        self.attachments = Some(attachments);
+        self.queue.submit([encoder.finish()]);
+        stats
+    }
+
+    /// The items that the camera may see, in an order that switches index buffers seldom and draws what
+    /// is near first, so that it hides what is behind at the least cost.
+    fn in_view<'a>(&self, layers: &[Layer], camera: &Camera, items: &'a [DrawItem]) -> Vec<Draw<'a>> {
+        let planes = camera.planes();
+        let mut draws: Vec<_> = items
+            .iter()
+            .filter_map(|item| {
+                let resident = self.residents.get(item)?;
+                let bounds = resident.bounds.filter(|b| b.touches(&planes))?;
+                let upper = layers.get(item.layer)?.forest.local(item.diamond).upper;
+                let sides = item.sides & if upper { 0b1111 } else { 0b0011 };
+                let distance = bounds.distance(camera.eye);
+                Some(Draw { item, sides, shares_triangles: resident.own.is_none(), distance })
+            })
+            .collect();
+        draws.sort_by(|a, b| {
+            let key = |d: &Draw<'_>| (d.item.layer, !d.shares_triangles);
+            key(a).cmp(&key(b)).then(a.distance.total_cmp(&b.distance))
+        });
+        draws
+    }
+
+    fn write_uniforms(&mut self, layers: &[Layer], camera: &Camera, look: &Look, draws: &[Draw<'_>]) {
+        let nearest = draws.iter().map(|d| d.distance).fold(NEAR_MAX, f64::min);
+        // A little before the nearest box: rounding must not cut it.
+        let near = single((0.9 * nearest).max(NEAR_MIN));
+        let frame = FrameUniform::new(camera, look, near, !self.options.format.is_srgb());
+        self.queue.write_buffer(&self.frame_uniform, 0, bytemuck::bytes_of(&frame));
+
+        let references: Vec<_> = layers.iter().map(|layer| Reference::near(layer, camera.eye)).collect();
+        let mut uniforms = vec![0u8; LAYER_STRIDE * layers.len().max(1)];
+        for ((layer, reference), slot) in
+            layers.iter().zip(&references).zip(uniforms.chunks_mut(LAYER_STRIDE))
+        {
+            let uniform = reference.uniform(layer, camera.eye);
+            slot[..size_of::<LayerUniform>()].copy_from_slice(bytemuck::bytes_of(&uniform));
+        }
+        let (buffer, _) = match self.layers.take() {
+            Some(old) if old.0.size() >= uniforms.len() as u64 => self.layers.insert(old),
+            _ => self.layers.insert(layer_group(&self.device, &self.layer_layout, uniforms.len())),
+        };
+        self.queue.write_buffer(buffer, 0, &uniforms);
+
+        let instances: Vec<_> = draws
+            .iter()
+            .map(|draw| {
+                let layer = draw.item.layer;
+                let local = layers[layer].forest.local(draw.item.diamond);
+                // Steps are at most a root square's side, 2^24.
+                let [ux, uy, vx, vy] = [local.u[0], local.u[1], local.v[0], local.v[1]]
+                    .map(|step| i32::try_from(step).unwrap_or(0));
+                Instance {
+                    origin: references[layer].relative(local.origin),
+                    axes: [ux, uy, vx, vy],
+                    level: [i32::try_from(draw.item.diamond.level()).unwrap_or(0), 0],
+                }
+            })
+            .collect();
+        let bytes: &[u8] = bytemuck::cast_slice(&instances);
+        let buffer = match self.instances.take() {
+            Some(old) if old.size() >= bytes.len() as u64 => self.instances.insert(old),
+            _ => self.instances.insert(self.device.create_buffer(&wgpu::BufferDescriptor {
+                label: Some("instances"),
+                size: (bytes.len() as u64).next_power_of_two().max(4096),
+                usage: wgpu::BufferUsages::VERTEX | wgpu::BufferUsages::COPY_DST,
+                mapped_at_creation: false,
+            })),
+        };
+        self.queue.write_buffer(buffer, 0, bytes);
+    }
+
+    fn draw_terrain(
+        &self,
+        pass: &mut wgpu::RenderPass<'_>,
+        layers: &[Layer],
+        draws: &[Draw<'_>],
+        stats: &mut FrameStats,
+    ) {
+        let (Some((_, layer_group)), Some(instances)) = (&self.layers, &self.instances) else { return };
+        pass.set_pipeline(&self.terrain);
+        pass.set_bind_group(0, &self.frame_group, &[]);
+        pass.set_vertex_buffer(2, instances.slice(..));
+        let (mut layer_now, mut triangles_now) = (None, None::<&Triangles>);
+        for (draw, instance) in draws.iter().zip(0u32..) {
+            let grid = self.residents.grid(layers[draw.item.layer].forest.segments());
+            let (Some(grid), Some(resident)) = (grid, self.residents.get(draw.item)) else { continue };
+            if layer_now != Some(draw.item.layer) {
+                layer_now = Some(draw.item.layer);
+                let offset = u32::try_from(LAYER_STRIDE * draw.item.layer).unwrap_or(0);
+                pass.set_bind_group(1, layer_group, &[offset]);
+                pass.set_vertex_buffer(0, grid.places.slice(..));
+            }
+            let triangles = resident.own.as_ref().unwrap_or(&grid.triangles);
+            if !triangles_now.is_some_and(|now| std::ptr::eq(now, triangles)) {
+                triangles_now = Some(triangles);
+                pass.set_index_buffer(triangles.indices.slice(..), wgpu::IndexFormat::Uint16);
+            }
+            pass.set_vertex_buffer(1, resident.points.slice(..));
+            for range in runs(&triangles.sides, draw.sides) {
+                stats.draws += 1;
+                stats.triangles += u64::from((range.end - range.start) / 3);
+                pass.draw_indexed(range, 0, instance..instance + 1);
+            }
+        }
+    }
+}
+
+/// The index ranges of the chosen sides, those that follow each other joined: at most two.
+fn runs(sides: &[Range<u32>; 4], chosen: u8) -> impl Iterator<Item = Range<u32>> {
+    let on = move |side: usize| side < 4 && chosen >> side & 1 == 1;
+    let first = (0..4).filter(move |side| on(*side) && (*side == 0 || !on(side - 1)));
+    first
+        .map(move |first| {
+            let last = (first..4).take_while(|side| on(*side)).last().unwrap_or(first);
+            sides[first].start..sides[last].end
+        })
+        .filter(|run| !run.is_empty())
+}
+
+impl Attachments {
+    fn new(device: &wgpu::Device, options: &Options, size: [u32; 2]) -> Self {
+        let view = |label, format| {
+            let [width, height] = size;
+            let texture = device.create_texture(&wgpu::TextureDescriptor {
+                label: Some(label),
+                size: wgpu::Extent3d { width, height, depth_or_array_layers: 1 },
+                mip_level_count: 1,
+                sample_count: options.samples,
+                dimension: wgpu::TextureDimension::D2,
+                format,
+                usage: wgpu::TextureUsages::RENDER_ATTACHMENT,
+                view_formats: &[],
+            });
+            texture.create_view(&wgpu::TextureViewDescriptor::default())
+        };
+        let colour = (options.samples > 1).then(|| view("samples", options.format));
+        Self { size, depth: view("depth", DEPTH), colour }
+    }
+}
+
+fn begin_pass<'a>(
+    encoder: &'a mut wgpu::CommandEncoder,
+    attachments: &Attachments,
+    view: &wgpu::TextureView,
+    look: &Look,
+    format: wgpu::TextureFormat,
+) -> wgpu::RenderPass<'a> {
+    let clear = match look.background {
+        Background::Sky => [0.0, 0.0, 0.0, 1.0],
+        Background::Colour(colour) => colour.map(f64::from),
+    };
+    let [r, g, b] = [0, 1, 2].map(|i| if format.is_srgb() { clear[i] } else { encoded(clear[i]) });
+    let (target, resolve_target) = match &attachments.colour {
+        Some(samples) => (samples, Some(view)),
+        None => (view, None),
+    };
+    let store = if resolve_target.is_some() { wgpu::StoreOp::Discard } else { wgpu::StoreOp::Store };
+    encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
+        label: Some("frame"),
+        color_attachments: &[Some(wgpu::RenderPassColorAttachment {
+            view: target,
+            depth_slice: None,
+            resolve_target,
+            ops: wgpu::Operations { load: wgpu::LoadOp::Clear(wgpu::Color { r, g, b, a: clear[3] }), store },
+        })],
+        depth_stencil_attachment: Some(wgpu::RenderPassDepthStencilAttachment {
+            view: &attachments.depth,
+            depth_ops: Some(wgpu::Operations {
+                load: wgpu::LoadOp::Clear(0.0),
+                store: wgpu::StoreOp::Discard,
+            }),
+            stencil_ops: None,
+        }),
+        ..Default::default()
+    })
+}
+
+/// The sRGB curve, for a clear colour on a target that stores colours as they are.
+fn encoded(linear: f64) -> f64 {
+    if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
+}
+
+fn layer_group(
+    device: &wgpu::Device,
+    layout: &wgpu::BindGroupLayout,
+    bytes: usize,
+) -> (wgpu::Buffer, wgpu::BindGroup) {
+    let buffer = device.create_buffer(&wgpu::BufferDescriptor {
+        label: Some("layers"),
+        size: bytes as u64,
+        usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+        mapped_at_creation: false,
+    });
+    let group = device.create_bind_group(&wgpu::BindGroupDescriptor {
+        label: Some("layers"),
+        layout,
+        entries: &[wgpu::BindGroupEntry {
+            binding: 0,
+            resource: wgpu::BindingResource::Buffer(wgpu::BufferBinding {
+                buffer: &buffer,
+                offset: 0,
+                size: wgpu::BufferSize::new(size_of::<LayerUniform>() as u64),
+            }),
+        }],
+    });
+    (buffer, group)
+}
+
+fn terrain_pipeline(
+    device: &wgpu::Device,
+    options: &Options,
+    groups: &[Option<&wgpu::BindGroupLayout>],
+) -> wgpu::RenderPipeline {
+    let buffers = [
+        Some(wgpu::VertexBufferLayout {
+            array_stride: 4,
+            step_mode: wgpu::VertexStepMode::Vertex,
+            attributes: &wgpu::vertex_attr_array![0 => Uint16x2],
+        }),
+        Some(wgpu::VertexBufferLayout {
+            array_stride: size_of::<SurfacePoint>() as u64,
+            step_mode: wgpu::VertexStepMode::Vertex,
+            attributes: &wgpu::vertex_attr_array![1 => Sint32, 2 => Snorm16x2],
+        }),
+        Some(wgpu::VertexBufferLayout {
+            array_stride: size_of::<Instance>() as u64,
+            step_mode: wgpu::VertexStepMode::Instance,
+            attributes: &wgpu::vertex_attr_array![3 => Sint32x2, 4 => Sint32x4, 5 => Sint32x2],
+        }),
+    ];
+    // Both faces are drawn: terrain seen from below is terrain still.
+    pipeline(device, options, groups, "terrain", TERRAIN_WGSL, &buffers, wgpu::CompareFunction::Greater)
+}
+
+fn sky_pipeline(
+    device: &wgpu::Device,
+    options: &Options,
+    groups: &[Option<&wgpu::BindGroupLayout>],
+) -> wgpu::RenderPipeline {
+    // Infinitely far, so equal to the cleared depth and behind all else.
+    pipeline(device, options, groups, "sky", SKY_WGSL, &[], wgpu::CompareFunction::GreaterEqual)
+}
+
+/// A pipeline with the entry points `NAME_vertex` and `NAME_fragment`.
+fn pipeline(
+    device: &wgpu::Device,
+    options: &Options,
+    groups: &[Option<&wgpu::BindGroupLayout>],
+    name: &str,
+    source: &str,
+    buffers: &[Option<wgpu::VertexBufferLayout<'_>>],
+    depth_compare: wgpu::CompareFunction,
+) -> wgpu::RenderPipeline {
+    let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+        label: Some(name),
+        source: wgpu::ShaderSource::Wgsl(source.into()),
+    });
+    let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+        label: Some(name),
+        bind_group_layouts: groups,
+        immediate_size: 0,
+    });
+    device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
+        label: Some(name),
+        layout: Some(&layout),
+        vertex: wgpu::VertexState {
+            module: &module,
+            entry_point: Some(&format!("{name}_vertex")),
+            compilation_options: wgpu::PipelineCompilationOptions::default(),
+            buffers,
+        },
+        primitive: wgpu::PrimitiveState::default(),
+        depth_stencil: Some(wgpu::DepthStencilState {
+            format: DEPTH,
+            depth_write_enabled: Some(depth_compare == wgpu::CompareFunction::Greater),
+            depth_compare: Some(depth_compare),
+            stencil: wgpu::StencilState::default(),
+            bias: wgpu::DepthBiasState::default(),
+        }),
+        multisample: wgpu::MultisampleState { count: options.samples, ..Default::default() },
+        fragment: Some(wgpu::FragmentState {
+            module: &module,
+            entry_point: Some(&format!("{name}_fragment")),
+            compilation_options: wgpu::PipelineCompilationOptions::default(),
+            targets: &[Some(wgpu::ColorTargetState {
+                format: options.format,
+                blend: None,
+                write_mask: wgpu::ColorWrites::ALL,
+            })],
+        }),
+        multiview_mask: None,
+        cache: None,
+    })
+}

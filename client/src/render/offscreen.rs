@@ -1,0 +1,120 @@
+//! Pictures without a window.
+
+use super::{FrameStats, Look, Options, RenderError, Renderer};
+use crate::camera::Camera;
+use crate::drawing::DrawItem;
+use crate::picture::Picture;
+use diamantina_protocol::message::Layer;
+
+/// A renderer with a target of its own, as large as the last picture.
+pub struct Offscreen {
+    renderer: Renderer,
+    target: Option<wgpu::Texture>,
+}
+
+impl Offscreen {
+    /// A renderer on the best adapter that there is, in software if need be. `options.format` is
+    /// replaced by the format of a [`Picture`]. Costs some tens of milliseconds.
+    ///
+    /// # Errors
+    /// When there is no adapter, or it gives no device.
+    pub fn new(options: &Options) -> Result<Self, RenderError> {
+        let mut description = wgpu::InstanceDescriptor::new_without_display_handle();
+        description.backends = wgpu::Backends::PRIMARY;
+        let instance = wgpu::Instance::new(description);
+        let adapter = pollster::block_on(instance.request_adapter(&wgpu::RequestAdapterOptions {
+            power_preference: wgpu::PowerPreference::HighPerformance,
+            ..Default::default()
+        }))
+        .map_err(|e| RenderError::NoAdapter(e.to_string()))?;
+        // No more than a browser has, so that whatever works here works there.
+        let limits = wgpu::Limits::downlevel_webgl2_defaults().using_resolution(adapter.limits());
+        let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
+            label: Some("offscreen"),
+            required_limits: limits,
+            ..Default::default()
+        }))
+        .map_err(|e| RenderError::Device(e.to_string()))?;
+        let options = Options { format: wgpu::TextureFormat::Rgba8UnormSrgb, ..*options };
+        Ok(Self { renderer: Renderer::new(device, queue, &options), target: None })
+    }
+
+    /// Draws a frame of `camera.size` pixels. See [`Renderer::draw`].
+    ///
+    /// # Errors
+    /// When the picture is empty or larger than the adapter can draw.
+    pub fn draw(
+        &mut self,
+        layers: &[Layer],
+        camera: &Camera,
+        items: &[DrawItem],
+        look: &Look,
+    ) -> Result<FrameStats, RenderError> {
+        let [width, height] = camera.size;
+        let limit = self.renderer.device().limits().max_texture_dimension_2d;
+        if !(1..=limit).contains(&width) || !(1..=limit).contains(&height) {
+            return Err(RenderError::Size { found: camera.size, limit });
+        }
+        let target = match self.target.take() {
+            Some(target) if [target.width(), target.height()] == camera.size => target,
+            _ => self.renderer.device().create_texture(&wgpu::TextureDescriptor {
+                label: Some("picture"),
+                size: wgpu::Extent3d { width, height, depth_or_array_layers: 1 },
+                mip_level_count: 1,
+                sample_count: 1,
+                dimension: wgpu::TextureDimension::D2,
+                format: wgpu::TextureFormat::Rgba8UnormSrgb,
+                usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::COPY_SRC,
+                view_formats: &[],
+            }),
+        };
+        let view = target.create_view(&wgpu::TextureViewDescriptor::default());
+        self.target = Some(target);
+        Ok(self.renderer.draw(layers, camera, items, look, &view))
+    }
+
+    /// The picture last drawn, once the GPU is done with it; an empty one before the first.
+    ///
+    /// # Errors
+    /// When the device was lost.
+    pub fn read(&self) -> Result<Picture, RenderError> {
+        let Some(target) = &self.target else { return Ok(Picture { size: [0, 0], pixels: Vec::new() }) };
+        let (device, queue) = (self.renderer.device(), self.renderer.queue());
+        let [width, height] = [target.width(), target.height()];
+        let row_bytes = (4 * width).next_multiple_of(wgpu::COPY_BYTES_PER_ROW_ALIGNMENT);
+        let buffer = device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("picture"),
+            size: u64::from(row_bytes) * u64::from(height),
+            usage: wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ,
+            mapped_at_creation: false,
+        });
+        let mut encoder = device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        encoder.copy_texture_to_buffer(
+            target.as_image_copy(),
+            wgpu::TexelCopyBufferInfo {
+                buffer: &buffer,
+                layout: wgpu::TexelCopyBufferLayout {
+                    offset: 0,
+                    bytes_per_row: Some(row_bytes),
+                    rows_per_image: None,
+                },
+            },
+            target.size(),
+        );
+        queue.submit([encoder.finish()]);
+        let (sender, receiver) = std::sync::mpsc::channel();
+        buffer.map_async(wgpu::MapMode::Read, .., move |result| {
+            // The receiver waits below.
+            let _ = sender.send(result);
+        });
+        let lost = |e: &dyn std::fmt::Display| RenderError::Read(e.to_string());
+        device.poll(wgpu::PollType::wait_indefinitely()).map_err(|e| lost(&e))?;
+        receiver.recv().map_err(|e| lost(&e))?.map_err(|e| lost(&e))?;
+        let bytes = buffer.get_mapped_range(..).map_err(|e| lost(&e))?;
+        let mut pixels = Vec::with_capacity(4 * width as usize * height as usize);
+        for row in bytes.chunks_exact(row_bytes as usize) {
+            pixels.extend_from_slice(&row[..4 * width as usize]);
+        }
+        Ok(Picture { size: [width, height], pixels })
+    }
+}

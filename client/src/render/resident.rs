@@ -1,0 +1,195 @@
+//! Surfaces on the GPU, under a budget of bytes.
+//!
+//! A surface takes 8 bytes a point (66 kB for n = 64) and, if it has nodata, its own index lists (up to
+//! 98 kB). Those that the present frame draws always stay; of the others, the longest unseen go first.
+
+use super::triangles::{self, Lists};
+use crate::camera::Bounds;
+use crate::drawing::DrawItem;
+use crate::surface::Surface;
+use diamantina_protocol::NODATA;
+use diamantina_protocol::diamond::Diamond;
+use diamantina_protocol::message::Layer;
+use glam::DVec3;
+use std::collections::HashMap;
+use std::ops::Range;
+use std::sync::{Arc, Weak};
+use wgpu::util::DeviceExt;
+
+/// A point of a surface: height in quanta, and the normal's east and north as snorm16.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+pub(super) struct SurfacePoint {
+    height: i32,
+    normal: [i16; 2],
+}
+
+/// What all diamonds of n segments share.
+pub(super) struct Grid {
+    /// Doubled local coordinates of each slot.
+    pub(super) places: wgpu::Buffer,
+    /// The index lists of the four sides.
+    pub(super) triangles: Triangles,
+}
+
+/// Index lists on the GPU.
+pub(super) struct Triangles {
+    /// 16-bit indices.
+    pub(super) indices: wgpu::Buffer,
+    /// Where each side's list lies.
+    pub(super) sides: [Range<u32>; 4],
+}
+
+/// A surface on the GPU.
+pub(super) struct Resident {
+    /// Which surface it is: the weak pointer keeps the address from being used again.
+    surface: Weak<Surface>,
+    /// A [`SurfacePoint`] a slot.
+    pub(super) points: wgpu::Buffer,
+    /// Its own index lists, if it has nodata.
+    pub(super) own: Option<Triangles>,
+    /// The box around all its points; `None` if none has a height.
+    pub(super) bounds: Option<Bounds>,
+    bytes: u64,
+    last_frame: u64,
+}
+
+type Key = (usize, Diamond);
+
+/// All surfaces on the GPU.
+pub(super) struct Residents {
+    budget_bytes: u64,
+    bytes: u64,
+    frame: u64,
+    by_key: HashMap<Key, Resident>,
+    by_segments: HashMap<usize, Grid>,
+}
+
+impl Residents {
+    pub(super) fn new(budget_bytes: u64) -> Self {
+        Self { budget_bytes, bytes: 0, frame: 0, by_key: HashMap::new(), by_segments: HashMap::new() }
+    }
+
+    /// Bytes of GPU memory that surfaces take.
+    pub(super) fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    pub(super) fn get(&self, item: &DrawItem) -> Option<&Resident> {
+        self.by_key.get(&(item.layer, item.diamond))
+    }
+
+    pub(super) fn grid(&self, segments: usize) -> Option<&Grid> {
+        self.by_segments.get(&segments)
+    }
+
+    /// Starts a frame that draws these items: uploads those that are not there yet, and drops others if
+    /// they exceed the budget. Returns the bytes uploaded. Items of unknown layers are passed over.
+    pub(super) fn start_frame(&mut self, device: &wgpu::Device, layers: &[Layer], items: &[DrawItem]) -> u64 {
+        self.frame += 1;
+        let mut uploaded_bytes = 0;
+        for item in items {
+            let Some(layer) = layers.get(item.layer) else { continue };
+            let n = layer.forest.segments();
+            if item.surface.block().segments() != n {
+                continue;
+            }
+            let key = (item.layer, item.diamond);
+            self.by_segments.entry(n).or_insert_with(|| Grid::new(device, n));
+            if let Some(resident) = self.by_key.get_mut(&key)
+                && std::ptr::eq(resident.surface.as_ptr(), Arc::as_ptr(&item.surface))
+            {
+                resident.last_frame = self.frame;
+                continue;
+            }
+            let resident = Resident::upload(device, layer, item, self.frame);
+            uploaded_bytes += resident.bytes;
+            self.bytes += resident.bytes;
+            if let Some(old) = self.by_key.insert(key, resident) {
+                self.bytes -= old.bytes;
+            }
+        }
+        self.shrink();
+        uploaded_bytes
+    }
+
+    /// Drops what this frame does not draw, longest unseen first, until the rest fits the budget.
+    fn shrink(&mut self) {
+        if self.bytes <= self.budget_bytes {
+            return;
+        }
+        let idle = self.by_key.iter().filter(|(_, r)| r.last_frame < self.frame);
+        let mut idle: Vec<(u64, Key)> = idle.map(|(key, r)| (r.last_frame, *key)).collect();
+        idle.sort_unstable();
+        for (_, key) in idle {
+            if self.bytes <= self.budget_bytes {
+                break;
+            }
+            if let Some(old) = self.by_key.remove(&key) {
+                self.bytes -= old.bytes;
+            }
+        }
+    }
+}
+
+impl Grid {
+    fn new(device: &wgpu::Device, n: usize) -> Self {
+        let places = device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+            label: Some("places"),
+            contents: bytemuck::cast_slice(&triangles::places(n)),
+            usage: wgpu::BufferUsages::VERTEX,
+        });
+        Self { places, triangles: Triangles::new(device, triangles::lists(n, |_| true)) }
+    }
+}
+
+impl Triangles {
+    fn new(device: &wgpu::Device, lists: Lists) -> Self {
+        // Buffers are whole numbers of 4 bytes.
+        let mut indices = lists.indices;
+        indices.resize(indices.len().next_multiple_of(2), 0);
+        let indices = device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+            label: Some("triangles"),
+            contents: bytemuck::cast_slice(&indices),
+            usage: wgpu::BufferUsages::INDEX,
+        });
+        Self { indices, sides: lists.sides }
+    }
+}
+
+impl Resident {
+    fn upload(device: &wgpu::Device, layer: &Layer, item: &DrawItem, frame: u64) -> Self {
+        let surface = &item.surface;
+        let heights = surface.block().heights();
+        let points: Vec<SurfacePoint> =
+            heights.iter().zip(surface.slopes()).map(|(h, slope)| point(*h, *slope)).collect();
+        let points = device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+            label: Some("surface"),
+            contents: bytemuck::cast_slice(&points),
+            usage: wgpu::BufferUsages::VERTEX,
+        });
+        let own = surface.has_nodata().then(|| Triangles::new(device, triangles::lists_of(surface.block())));
+        let bytes = points.size() + own.as_ref().map_or(0, |t| t.indices.size());
+        let bounds = bounds(layer, item.diamond, heights);
+        Self { surface: Arc::downgrade(surface), points, own, bounds, bytes, last_frame: frame }
+    }
+}
+
+/// A point as the GPU has it. One without height gets 0: no triangle uses it.
+fn point(height: i32, [east, north]: [f32; 2]) -> SurfacePoint {
+    let length = (1.0 + east * east + north * north).sqrt();
+    #[allow(clippy::cast_possible_truncation, reason = "a float to integer cast saturates")]
+    let snorm = |x: f32| (x * 32767.0).round() as i16;
+    let height = if height == NODATA { 0 } else { height };
+    SurfacePoint { height, normal: [snorm(-east / length), snorm(-north / length)] }
+}
+
+fn bounds(layer: &Layer, diamond: Diamond, heights: &[i32]) -> Option<Bounds> {
+    let valid = || heights.iter().copied().filter(|h| *h != NODATA);
+    let (lowest, highest) = (layer.metres(valid().min()?), layer.metres(valid().max()?));
+    let [south_west, north_east] = layer.forest.bounds(diamond).map(|p| layer.position(p));
+    Some(Bounds {
+        min: DVec3::new(south_west[0], south_west[1], lowest),
+        max: DVec3::new(north_east[0], north_east[1], highest),
+    })
+}

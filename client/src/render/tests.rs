@@ -1,0 +1,422 @@
+//! Pictures of made-up terrain, on any adapter, software included.
+
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    reason = "made-up numbers, small and positive"
+)]
+
+use super::*;
+use crate::camera::FOV_Y;
+use crate::picture::{Picture, write_png};
+use crate::surface::Surface;
+use diamantina_protocol::NODATA;
+use diamantina_protocol::bintree::Forest;
+use diamantina_protocol::diamond::{Block, Diamond};
+use diamantina_protocol::message::Kind;
+use diamantina_protocol::points::{self, Coding, Rule};
+use std::collections::{HashMap, HashSet};
+use std::sync::Arc;
+
+const MAGENTA: Background = Background::Colour([1.0, 0.0, 1.0, 1.0]);
+
+/// Without haze and over magenta.
+const PLAIN: Look = Look {
+    background: MAGENTA,
+    sun: Sun { azimuth_degrees: 315.0, altitude_degrees: 45.0 },
+    colours: Colours::Hypsometric,
+    haze: 0.0,
+    show_levels: false,
+};
+
+/// A layer with all surfaces of its forest, decoded from payloads as a client does.
+struct World {
+    layer: Layer,
+    surfaces: HashMap<Diamond, Arc<Surface>>,
+}
+
+impl World {
+    /// `height` gives quanta, of 0.1 m, at lattice points.
+    fn new(forest: Forest, cell: f64, height: impl Fn(u32, u32) -> i32) -> Self {
+        let coding = Coding::new(Rule::Smooth, 3, vec![0; forest.levels() as usize + 1]).unwrap();
+        let mut blocks: HashMap<Diamond, Block> = HashMap::new();
+        let mut payloads = Vec::new();
+        let mut range = [i32::MAX, i32::MIN];
+        for level in 0..forest.levels() {
+            for d in forest.diamonds(level) {
+                let mut source = Block::empty(&forest);
+                source.fill(&forest.local(d), |x, y| {
+                    let h = height(x, y);
+                    if h != NODATA {
+                        range = [range[0].min(h), range[1].max(h)];
+                    }
+                    h
+                });
+                let mut block = Block::empty(&forest);
+                for parent in forest.parents(d) {
+                    block.inherit(&forest, d, parent, &blocks[&parent]);
+                }
+                payloads.push((d, points::encode(&forest, &coding, d, &mut block, &source)));
+                blocks.insert(d, block);
+            }
+        }
+        let [width, depth] = forest.size();
+        let layer = Layer {
+            name: "terrain".into(),
+            kind: Kind::Terrain,
+            forest,
+            // Far from the frame's origin, as in a projected system.
+            origin: [612_345.25, 4_512_345.75],
+            cell: [cell, cell],
+            samples: [width + 1, depth + 1],
+            valid_samples: u64::from(width + 1) * u64::from(depth + 1),
+            quantum: 0.1,
+            height_offset: 0.0,
+            heights: range.map(|h| f64::from(h) * 0.1),
+            max_error: 0.1,
+            finest_error: 0.1,
+            encodings: vec!["points".into()],
+            coding,
+            bytes: 0,
+            resampled: false,
+            errors: "exact".into(),
+        };
+        let mut surfaces: HashMap<Diamond, Arc<Surface>> = HashMap::new();
+        for (d, payload) in payloads {
+            let surface = {
+                let parents: Vec<_> = forest.parents(d).map(|p| (p, &*surfaces[&p])).collect();
+                Surface::split(&layer, d, &parents, &payload).unwrap()
+            };
+            surfaces.insert(d, Arc::new(surface));
+        }
+        Self { layer, surfaces }
+    }
+
+    /// What is drawn if exactly these diamonds are split: the sides where no split child is.
+    fn cut(&self, split: &HashSet<Diamond>) -> Vec<DrawItem> {
+        let forest = self.layer.forest;
+        let items = split.iter().map(|d| {
+            let children = forest.children(*d);
+            let sides = (0..4)
+                .filter(|side| !children[*side].is_some_and(|c| split.contains(&c)))
+                .fold(0u8, |sides, side| sides | 1 << side);
+            DrawItem { layer: 0, diamond: *d, surface: Arc::clone(&self.surfaces[d]), sides }
+        });
+        items.filter(|item| item.sides != 0).collect()
+    }
+
+    /// The cut that splits all diamonds above a level.
+    fn level(&self, level: u32) -> Vec<DrawItem> {
+        self.cut(&self.surfaces.keys().copied().filter(|d| d.level() < level).collect())
+    }
+
+    /// A cut that splits each diamond whose parents are split with a chance of `numerator` in 8.
+    fn random_cut(&self, seed: u64, numerator: u64) -> Vec<DrawItem> {
+        let forest = self.layer.forest;
+        let mut state = seed;
+        let mut split: HashSet<_> = forest.root_diamonds().collect();
+        for level in 1..forest.levels() {
+            for d in forest.diamonds(level) {
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                if (state >> 40) % 8 < numerator && forest.parents(d).all(|p| split.contains(&p)) {
+                    split.insert(d);
+                }
+            }
+        }
+        self.cut(&split)
+    }
+
+    /// The frame's coordinates of a place in the forest: 0 to 1 east and north, and metres up.
+    fn place(&self, east: f64, north: f64, up: f64) -> DVec3 {
+        let [w, h] = self.layer.forest.size().map(f64::from);
+        let (origin, cell) = (self.layer.origin, self.layer.cell);
+        DVec3::new(origin[0] + east * w * cell[0], origin[1] + north * h * cell[1], up)
+    }
+
+    /// A camera straight above the middle that sees the whole forest, with a margin.
+    fn overhead(&self, size: [u32; 2]) -> Camera {
+        let [w, h] = self.layer.forest.size().map(f64::from);
+        let extent = (w * self.layer.cell[0]).max(h * self.layer.cell[1]);
+        let eye = self.place(0.5, 0.5, self.layer.heights[1] + 1.6 * extent);
+        Camera { eye, target: self.place(0.5, 0.5, 0.0), fov_y: FOV_Y, size }
+    }
+}
+
+fn offscreen(samples: u32, budget_bytes: u64) -> Offscreen {
+    let options = Options { samples, budget_bytes, ..Options::default() };
+    Offscreen::new(&options).unwrap_or_else(|e| panic!("{e}"))
+}
+
+fn picture(world: &World, camera: &Camera, items: &[DrawItem], look: &Look) -> Picture {
+    let mut offscreen = offscreen(1, 1 << 30);
+    offscreen.draw(std::slice::from_ref(&world.layer), camera, items, look).unwrap();
+    offscreen.read().unwrap()
+}
+
+fn is_background(picture: &Picture, x: u32, y: u32) -> bool {
+    picture.pixel([x, y]) == Some([255, 0, 255, 255])
+}
+
+/// Where a point of the frame lies in the picture.
+fn pixel_of(camera: &Camera, p: DVec3) -> [f64; 2] {
+    let clip = camera.clip_from_eye(1.0).project_point3((p - camera.eye).as_vec3());
+    let [w, h] = camera.size.map(f64::from);
+    [(f64::from(clip.x) + 1.0) / 2.0 * w, (1.0 - f64::from(clip.y)) / 2.0 * h]
+}
+
+/// Smooth noise of about 0 to 1: values at whole numbers, interpolated, in octaves.
+fn noise(x: f64, y: f64, octaves: u32, ridged: bool) -> f64 {
+    let value = |i: i64, j: i64, k: u32| {
+        let mut h =
+            (i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ (j as u64).wrapping_mul(0xc2b2_ae3d_27d4_eb4f);
+        h ^= u64::from(k).wrapping_mul(0x1656_67b1_9e37_79f9);
+        h = (h ^ h >> 31).wrapping_mul(0x7fb5_d329_728e_a185);
+        h = (h ^ h >> 27).wrapping_mul(0x81da_def4_bc2d_d44d);
+        (h >> 11) as f64 / (1u64 << 53) as f64
+    };
+    let (mut sum, mut weight, mut scale, mut total) = (0.0, 1.0, 1.0, 0.0);
+    let mut gain = 1.0;
+    for k in 0..octaves {
+        let (x, y) = (x * scale + f64::from(k) * 17.3, y * scale + f64::from(k) * 9.1);
+        let (i, j) = (x.floor(), y.floor());
+        let fade = |t: f64| t * t * t * (t * (t * 6.0 - 15.0) + 10.0);
+        let (s, t) = (fade(x - i), fade(y - j));
+        let at = |di: i64, dj: i64| value(i as i64 + di, j as i64 + dj, k);
+        let low = at(0, 0) + (at(1, 0) - at(0, 0)) * s;
+        let high = at(0, 1) + (at(1, 1) - at(0, 1)) * s;
+        let plain = low + (high - low) * t;
+        let octave = if ridged { (1.0 - (2.0 * plain - 1.0).abs()).powi(2) } else { plain };
+        sum += octave * weight * gain;
+        total += weight;
+        gain = if ridged { (octave * 1.6).clamp(0.25, 1.0) } else { 1.0 };
+        weight *= 0.5;
+        scale *= 2.03;
+    }
+    sum / total
+}
+
+fn rough(x: u32, y: u32) -> i32 {
+    (noise(f64::from(x) / 13.0, f64::from(y) / 13.0, 4, false) * 4000.0) as i32
+}
+
+#[test]
+fn the_whole_forest_is_covered_and_nothing_else() {
+    // Heights fall to 0 at the border, gently enough that nothing leans over the outline.
+    let forest = Forest::new(5, 3, [2, 1]).unwrap();
+    let [w, h] = forest.size();
+    let to_border = |x: u32, y: u32| x.min(y).min(w - x).min(h - y).cast_signed();
+    let world = World::new(forest, 30.0, |x, y| rough(x, y).min(60 * to_border(x, y)));
+    let camera = world.overhead([320, 240]);
+    let (a, b) =
+        (pixel_of(&camera, world.place(0.0, 1.0, 0.0)), pixel_of(&camera, world.place(1.0, 0.0, 0.0)));
+    for level in 1..=forest.levels() {
+        let picture = picture(&world, &camera, &world.level(level), &PLAIN);
+        let mut inside = 0;
+        for y in 0..240 {
+            for x in 0..320 {
+                let (px, py) = (f64::from(x) + 0.5, f64::from(y) + 0.5);
+                let within = |margin: f64| {
+                    px > a[0] + margin && px < b[0] - margin && py > a[1] + margin && py < b[1] - margin
+                };
+                if within(0.01) {
+                    inside += 1;
+                    assert!(!is_background(&picture, x, y), "hole at {x} {y}, level {level}");
+                } else if !within(-0.01) {
+                    assert!(is_background(&picture, x, y), "terrain at {x} {y}, level {level}");
+                }
+            }
+        }
+        assert!(inside > 10_000, "{inside}");
+    }
+}
+
+#[test]
+fn mixed_levels_have_no_cracks() {
+    let world = World::new(Forest::new(6, 2, [3, 2]).unwrap(), 30.0, rough);
+    let camera = Camera {
+        eye: world.place(0.5, 0.25, 900.0),
+        target: world.place(0.5, 0.5, 100.0),
+        fov_y: 0.5,
+        size: [640, 400],
+    };
+    for seed in 0..6 {
+        let items = world.random_cut(seed, 5 + seed % 3);
+        let picture = picture(&world, &camera, &items, &PLAIN);
+        let holes = (0..400).flat_map(|y| (0..640).map(move |x| (x, y)));
+        let holes: Vec<_> = holes.filter(|(x, y)| is_background(&picture, *x, *y)).collect();
+        assert!(holes.is_empty(), "seed {seed}: {} holes, first {:?}", holes.len(), holes[0]);
+    }
+}
+
+/// Mean red, green and blue around a place of the picture, 0 to 1 from the left and from the top.
+fn mean(picture: &Picture, x: f64, y: f64) -> [f64; 3] {
+    let [w, h] = picture.size.map(f64::from);
+    let (x, y) = ((x * w) as u32, (y * h) as u32);
+    let mut sum = [0.0; 3];
+    for dy in 0..9 {
+        for dx in 0..9 {
+            let pixel = picture.pixel([x + dx - 4, y + dy - 4]).unwrap();
+            (0..3).for_each(|i| sum[i] += f64::from(pixel[i]) / 81.0);
+        }
+    }
+    sum
+}
+
+#[test]
+fn north_is_up_and_east_is_right() {
+    // A high plateau in the north-east, the rest low.
+    let forest = Forest::new(5, 3, [1, 1]).unwrap();
+    let world = World::new(forest, 30.0, |x, y| if x > 18 && y > 18 { 500 } else { 0 });
+    let picture = picture(&world, &world.overhead([300, 300]), &world.level(4), &PLAIN);
+    let corners = [(0.65, 0.35), (0.35, 0.35), (0.35, 0.65), (0.65, 0.65)].map(|(x, y)| mean(&picture, x, y));
+    assert!(corners[0].iter().all(|c| *c > 190.0), "summits are white: {corners:?}");
+    for low in &corners[1..] {
+        assert!(low[1] > low[0] * 1.2 && low[1] > low[2] * 1.2, "lowlands are green: {corners:?}");
+    }
+}
+
+#[test]
+fn light_comes_from_the_north_west() {
+    // A cone: its north-western face looks at the sun.
+    let forest = Forest::new(5, 3, [1, 1]).unwrap();
+    let world = World::new(forest, 30.0, |x, y| {
+        let (dx, dy) = (f64::from(x) - 16.0, f64::from(y) - 16.0);
+        5000 - (dx.hypot(dy) * 200.0) as i32
+    });
+    let look = Look { colours: Colours::Flat, ..PLAIN };
+    let picture = picture(&world, &world.overhead([300, 300]), &world.level(4), &look);
+    let [north_west, south_east] = [(0.4, 0.4), (0.6, 0.6)].map(|(x, y)| mean(&picture, x, y)[1]);
+    assert!(north_west > south_east + 60.0, "{north_west} {south_east}");
+}
+
+#[test]
+fn nodata_stays_background() {
+    let forest = Forest::new(5, 3, [1, 1]).unwrap();
+    let hole = |x: u32, y: u32| (10..=20).contains(&x) && (12..=22).contains(&y);
+    let world = World::new(forest, 30.0, |x, y| if hole(x, y) { NODATA } else { 300 });
+    let camera = world.overhead([300, 300]);
+    for items in [world.level(4), world.level(2), world.random_cut(3, 6)] {
+        let picture = picture(&world, &camera, &items, &PLAIN);
+        let at = |x: f64, y: f64| {
+            let [px, py] = pixel_of(&camera, world.place(x / 32.0, y / 32.0, 30.0));
+            is_background(&picture, px as u32, py as u32)
+        };
+        for (x, y) in [(15.0, 17.0), (10.2, 12.2), (19.8, 21.8)] {
+            assert!(at(x, y), "no terrain in the hole at {x} {y}");
+        }
+        for (x, y) in [(2.0, 17.0), (30.0, 17.0), (15.0, 2.0), (15.0, 30.0)] {
+            assert!(!at(x, y), "terrain at {x} {y}");
+        }
+    }
+}
+
+#[test]
+fn the_eye_may_be_very_near_or_very_far() {
+    let world = World::new(Forest::new(5, 3, [1, 1]).unwrap(), 30.0, |_, _| 1000);
+    for above in [0.2, 5.0, 1e3, 1e6] {
+        let eye = world.place(0.5, 0.5, 100.0 + above);
+        let fov_y = (2.0 * 100.0f64.atan2(above)).min(FOV_Y);
+        let camera = Camera { eye, target: eye - DVec3::Z, fov_y, size: [64, 64] };
+        let picture = picture(&world, &camera, &world.level(4), &PLAIN);
+        assert!(!is_background(&picture, 32, 32), "{above} m above");
+    }
+}
+
+#[test]
+fn surfaces_are_uploaded_once_and_dropped_over_budget() {
+    let world = World::new(Forest::new(5, 2, [1, 1]).unwrap(), 30.0, rough);
+    let layers = std::slice::from_ref(&world.layer);
+    let camera = world.overhead([64, 64]);
+    let (coarse, fine) = (world.level(1), world.level(6));
+    let one = (5 * 5 + 4 * 4) * 8;
+    let budget_bytes = one * (fine.len() as u64);
+    let mut offscreen = offscreen(1, budget_bytes);
+    let stats = offscreen.draw(layers, &camera, &coarse, &PLAIN).unwrap();
+    assert_eq!(stats, FrameStats { triangles: 64, draws: 1, uploaded_bytes: one, gpu_bytes: one });
+    assert_eq!(offscreen.draw(layers, &camera, &coarse, &PLAIN).unwrap().uploaded_bytes, 0);
+    // Another surface of the same diamond takes the place of the first.
+    let again: Vec<_> = coarse
+        .iter()
+        .map(|item| DrawItem { surface: Arc::new((*item.surface).clone()), ..item.clone() })
+        .collect();
+    let stats = offscreen.draw(layers, &camera, &again, &PLAIN).unwrap();
+    assert_eq!((stats.uploaded_bytes, stats.gpu_bytes), (one, one));
+    let stats = offscreen.draw(layers, &camera, &fine, &PLAIN).unwrap();
+    assert_eq!(stats.gpu_bytes, budget_bytes, "the coarse one went, what is drawn stayed");
+    assert_eq!(stats.triangles, 32 * 32 * 2);
+}
+
+#[test]
+fn sizes_and_unknown_layers_are_refused() {
+    let world = World::new(Forest::new(4, 2, [1, 1]).unwrap(), 30.0, rough);
+    let mut offscreen = offscreen(4, 1 << 30);
+    let empty = Camera { size: [0, 4], ..world.overhead([4, 4]) };
+    let result = offscreen.draw(&[], &empty, &[], &PLAIN);
+    assert!(matches!(result, Err(RenderError::Size { found: [0, 4], .. })));
+    // Nothing is drawn without its layer.
+    let stats = offscreen.draw(&[], &world.overhead([5, 3]), &world.level(1), &PLAIN).unwrap();
+    assert_eq!(stats, FrameStats::default());
+    assert!(is_background(&offscreen.read().unwrap(), 4, 2));
+}
+
+#[test]
+fn runs_join_neighbouring_sides() {
+    let sides = [0..3, 3..6, 6..9, 9..12];
+    let found = |chosen| runs(&sides, chosen).map(|r| [r.start, r.end]).collect::<Vec<_>>();
+    assert_eq!(found(0b1111), [[0, 12]]);
+    assert_eq!(found(0b0110), [[3, 9]]);
+    assert_eq!(found(0b1011), [[0, 6], [9, 12]]);
+    assert_eq!(found(0b0101), [[0, 3], [6, 9]]);
+    assert!(found(0).is_empty());
+}
+
+/// Not a check but a look: `cargo test -p diamantina-client mountains -- --ignored`, then open the
+/// pictures in the temporary folder. Prints what a frame costs.
+#[test]
+#[ignore = "writes pictures for a person to judge"]
+#[allow(clippy::print_stdout, reason = "its output is for a person")]
+fn mountains_look_like_mountains() {
+    let forest = Forest::new(10, 6, [1, 1]).unwrap();
+    let height = |x: u32, y: u32| {
+        let (x, y) = (f64::from(x) / 330.0, f64::from(y) / 330.0);
+        let base = noise(x * 0.7 + 3.0, y * 0.7 + 1.0, 3, false);
+        let ridges = noise(x + 0.3 * base, y, 9, true);
+        ((ridges * (base - 0.15).max(0.02) * 9000.0 - 250.0) * 10.0) as i32
+    };
+    let world = World::new(forest, 30.0, height);
+    let layers = std::slice::from_ref(&world.layer);
+    let size = [1380, 768];
+    let above = world.overhead(size);
+    let oblique = Camera {
+        eye: world.place(0.5, -0.12, 6500.0),
+        target: world.place(0.5, 0.45, 600.0),
+        fov_y: FOV_Y,
+        size,
+    };
+    let low =
+        Camera { eye: world.place(0.35, 0.2, 2400.0), target: world.place(0.62, 0.6, 1500.0), ..oblique };
+    println!("heights {:?}", world.layer.heights);
+    for (samples, level) in [(4, 8), (1, 8), (1, 7), (1, 5)] {
+        let mut offscreen = offscreen(samples, 1 << 30);
+        let items = world.level(level);
+        for (name, camera) in [("above", &above), ("oblique", &oblique), ("low", &low)] {
+            for show_levels in [false, true].into_iter().take(if level == 8 { 2 } else { 1 }) {
+                let look = Look { show_levels, ..Look::default() };
+                let mut frame = || {
+                    let start = std::time::Instant::now();
+                    let stats = offscreen.draw(layers, camera, &items, &look).unwrap();
+                    let encoded = start.elapsed();
+                    let picture = offscreen.read().unwrap();
+                    (start.elapsed(), encoded, stats, picture)
+                };
+                let frames = (0..8).map(|_| frame());
+                let (whole, encoded, stats, picture) = frames.min_by_key(|f| f.0).unwrap();
+                println!("{name} {samples} samples: {whole:?}, {encoded:?} of it encoding, {stats:?}");
+                let file = format!("diamantina-{name}-{samples}-{level}-{show_levels}.png");
+                let file = std::fs::File::create(std::env::temp_dir().join(file)).unwrap();
+                write_png(&picture, file).unwrap();
+            }
+        }
+    }
+}

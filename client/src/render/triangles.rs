@@ -1,0 +1,218 @@
+//! The triangles of a split diamond, as index lists: one list for each of its four sides.
+//!
+//! A split puts a new point in the middle of each cell of the old grid. The sides of the cells are the
+//! hypotenuses of the new micro-triangles, and the new point is their apex, so each cell has four:
+//!
+//! ```text
+//!   +-------+        Seen whole, the micro-triangle over side s of a cell belongs to the triangle of
+//!   | \ 2 / |        the split in which it lies: 0 is south, 1 east, 2 north, 3 west of the diamond's
+//!   | 3 * 1 |        centre, in local coordinates. Micro-triangles never straddle the diagonals that
+//!   | / 0 \ |        part the four, since those diagonals run along cells' diagonals.
+//!   +-------+
+//! ```
+//!
+//! Each list has n^2 triangles, which turn left seen from above.
+
+use diamantina_protocol::NODATA;
+use diamantina_protocol::diamond::Block;
+use std::ops::Range;
+
+/// Index lists, one after the other in the order of the sides.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Lists {
+    /// Slots of a block, three a triangle. 16 bits are enough: n = 128 has 33,025 slots.
+    pub(super) indices: Vec<u16>,
+    /// Where each side's list lies in `indices`.
+    pub(super) sides: [Range<u32>; 4],
+}
+
+/// The lists of a diamond of `n` segments, of those triangles whose three slots `keep` wants.
+pub(super) fn lists(n: usize, keep: impl Fn(usize) -> bool) -> Lists {
+    let mut parts: [Vec<u16>; 4] = std::array::from_fn(|_| Vec::new());
+    for v in 0..n {
+        for u in 0..n {
+            let apex = Block::slot(n, 2 * u + 1, 2 * v + 1);
+            let corner = |du: usize, dv: usize| Block::slot(n, 2 * (u + du), 2 * (v + dv));
+            let corners = [corner(0, 0), corner(1, 0), corner(1, 1), corner(0, 1)];
+            for side in 0..4 {
+                let triangle = [corners[side], corners[(side + 1) % 4], apex];
+                if triangle.iter().all(|slot| keep(*slot)) {
+                    parts[side_of(n, u, v, side)].extend(triangle.map(|s| u16::try_from(s).unwrap_or(0)));
+                }
+            }
+        }
+    }
+    let mut end = 0;
+    let sides = parts.each_ref().map(|part| {
+        let start = end;
+        end += u32::try_from(part.len()).unwrap_or(0);
+        start..end
+    });
+    Lists { indices: parts.concat(), sides }
+}
+
+/// The lists of a diamond with nodata: triangles with a point that has no height are dropped.
+pub(super) fn lists_of(block: &Block) -> Lists {
+    lists(block.segments(), |slot| block.heights()[slot] != NODATA)
+}
+
+/// The triangle of the split in which the micro-triangle over `side` of the cell (u, v) lies.
+fn side_of(n: usize, u: usize, v: usize, side: usize) -> usize {
+    // Three times the centroid in doubled coordinates; the diamond's centre is at 3n.
+    let [east, north] = [[3, 1], [5, 3], [3, 5], [1, 3]][side];
+    let (x, y, centre) = (6 * u + east, 6 * v + north, 3 * n);
+    match (x.abs_diff(centre) > y.abs_diff(centre), x > centre, y > centre) {
+        (true, true, _) => 1,
+        (true, false, _) => 3,
+        (false, _, true) => 2,
+        (false, _, false) => 0,
+    }
+}
+
+/// Doubled local coordinates (2u, 2v) of each slot of a block of `n` segments.
+pub(super) fn places(n: usize) -> Vec<[u16; 2]> {
+    let mut places = vec![[0; 2]; (n + 1) * (n + 1) + n * n];
+    for q in 0..=2 * n {
+        for p in (q % 2..=2 * n).step_by(2) {
+            places[Block::slot(n, p, q)] = [p, q].map(|i| u16::try_from(i).unwrap_or(0));
+        }
+    }
+    places
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::{BTreeMap, BTreeSet};
+
+    type Place = [i64; 2];
+
+    fn triangles(n: usize) -> [Vec<[Place; 3]>; 4] {
+        let (lists, places) = (lists(n, |_| true), places(n));
+        lists.sides.map(|range| {
+            lists.indices[range.start as usize..range.end as usize]
+                .chunks(3)
+                .map(|t| [0, 1, 2].map(|i| places[usize::from(t[i])].map(i64::from)))
+                .collect()
+        })
+    }
+
+    fn double_area([a, b, c]: [Place; 3]) -> i64 {
+        (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+    }
+
+    #[test]
+    fn each_side_has_n_squared_triangles_that_turn_left() {
+        for n in [4usize, 8, 64, 128] {
+            for list in triangles(n) {
+                assert_eq!(list.len(), n * n);
+                // A quarter of the square of 2n, all in micro-triangles of area 1.
+                assert!(list.iter().all(|t| double_area(*t) == 2));
+            }
+        }
+    }
+
+    #[test]
+    fn the_lists_cover_the_square_exactly() {
+        let n = 8i64;
+        let mut covered = BTreeMap::new();
+        for list in triangles(8) {
+            for [a, b, c] in list {
+                // A triangle of area 1 is known by its hypotenuse and its side: its centroid, times 3.
+                let centroid = [a[0] + b[0] + c[0], a[1] + b[1] + c[1]];
+                assert!((0..=6 * n).contains(&centroid[0]) && (0..=6 * n).contains(&centroid[1]));
+                *covered.entry(centroid).or_insert(0) += 1;
+            }
+        }
+        assert!(covered.values().all(|count| *count == 1), "no triangle twice");
+        assert_eq!(covered.len(), 4 * 8 * 8, "areas add up to the square's");
+        // Every inner edge has two triangles, every edge of the square one: so nothing overlaps.
+        let mut edges = BTreeMap::new();
+        for [a, b, c] in triangles(8).concat() {
+            for (from, to) in [(a, b), (b, c), (c, a)] {
+                assert_eq!(edges.insert((from, to), ()), None, "an edge is walked once each way");
+            }
+        }
+        let border = |p: &Place| p.iter().any(|i| *i == 0 || *i == 2 * n);
+        for (from, to) in edges.keys() {
+            let outer = border(from) && border(to) && (from[0] == to[0] || from[1] == to[1]);
+            assert_eq!(edges.contains_key(&(*to, *from)), !outer, "{from:?} {to:?}");
+        }
+    }
+
+    /// The same triangles, found the other way: walking the local grid of the child at each side.
+    #[test]
+    fn the_triangles_are_those_of_the_childs_local_grid() {
+        let n = 8i64;
+        let ends = [
+            [[0, 0], [2 * n, 0]],
+            [[2 * n, 0], [2 * n, 2 * n]],
+            [[2 * n, 2 * n], [0, 2 * n]],
+            [[0, 2 * n], [0, 0]],
+        ];
+        for (side, list) in triangles(8).into_iter().enumerate() {
+            // Seen from inside, the child's hypotenuse runs from b to a: its lower triangle turns left.
+            let [b, a] = ends[side];
+            let apex = [n, n];
+            let step = |from: Place, to: Place| [(to[0] - from[0]) / n, (to[1] - from[1]) / n];
+            let (u, v) = (step(a, apex), step(apex, b));
+            let at = |i: i64, j: i64| [a[0] + u[0] * i + v[0] * j, a[1] + u[1] * i + v[1] * j];
+            let sorted = |mut t: [Place; 3]| {
+                t.sort_unstable();
+                t
+            };
+            let mut expected = BTreeSet::new();
+            for j in 0..n {
+                for i in j..n {
+                    let (low, high) = ((i, j), (i + 1, j + 1));
+                    let (east, west) = ((i + 1, j), (i, j + 1));
+                    let pair = if (i + j) % 2 == 0 {
+                        [[low, east, high], [low, high, west]]
+                    } else {
+                        [[low, east, west], [east, high, west]]
+                    };
+                    let count = if i == j { 1 } else { 2 };
+                    for t in &pair[..count] {
+                        expected.insert(sorted(t.map(|(i, j)| at(i, j))));
+                    }
+                }
+            }
+            let found: BTreeSet<_> = list.into_iter().map(sorted).collect();
+            assert_eq!(found, expected, "side {side}");
+        }
+    }
+
+    #[test]
+    fn hypotenuses_join_old_points_and_apexes_are_new() {
+        for [a, b, c] in triangles(8).concat() {
+            assert!(a.iter().chain(&b).all(|i| i % 2 == 0) && c.iter().all(|i| i % 2 == 1));
+            assert_eq!((a[0] - b[0]).abs() + (a[1] - b[1]).abs(), 2, "one step of the old grid");
+        }
+    }
+
+    #[test]
+    fn a_side_has_the_points_of_the_old_grids_side() {
+        let n = 8;
+        for (side, list) in triangles(8).into_iter().enumerate() {
+            let on_side = |p: &Place| match side {
+                0 => p[1] == 0,
+                1 => p[0] == 2 * n,
+                2 => p[1] == 2 * n,
+                _ => p[0] == 0,
+            };
+            let points: BTreeSet<_> = list.into_iter().flatten().filter(on_side).collect();
+            assert_eq!(points.len(), 8 + 1);
+            assert!(points.iter().all(|p| p.iter().all(|i| i % 2 == 0)));
+        }
+    }
+
+    #[test]
+    fn triangles_without_a_point_are_dropped() {
+        let (n, all) = (4, lists(4, |_| true));
+        let hole = Block::slot(n, 1, 1);
+        let some = lists(n, |slot| slot != hole);
+        assert_eq!(all.indices.len() - some.indices.len(), 4 * 3, "the four triangles of a cell");
+        assert!(!some.indices.contains(&u16::try_from(hole).unwrap()));
+        assert_eq!(some.sides[3].end as usize, some.indices.len());
+    }
+}

@@ -1,0 +1,79 @@
+// What all shaders of a frame share: uniforms, light and haze. Prepended to each of the others.
+// The Rust twins of the structs are in client/src/render/frame.rs.
+//
+// Positions are relative to the eye, in metres: x east, y north, z up. Colours are linear.
+
+struct Frame {
+    clip_from_eye: mat4x4<f32>,
+    // A view ray is forward + clip.x * right + clip.y * up.
+    right: vec4<f32>,
+    up: vec4<f32>,
+    forward: vec4<f32>,
+    // xyz: towards the sun. w: height of the eye, in metres.
+    sun: vec4<f32>,
+    // rgb: the sky at the horizon, which haze takes on. w: haze of a metre at height 0.
+    horizon: vec4<f32>,
+    // rgb: the sky overhead.
+    zenith: vec4<f32>,
+    // x: 1 to encode sRGB here, because the target does not. y: 1 to tint levels. z: 1 for one flat colour.
+    options: vec4<f32>,
+    // rgb: colours of land, low to high. w: where each stands in the range of heights, 0 to 1.
+    land: array<vec4<f32>, 8>,
+    // rgb: colours of the sea, shallow to deep. w: where each stands in the range of depths, 0 to 1.
+    sea: array<vec4<f32>, 4>,
+}
+
+struct Layer {
+    // Metres of a lattice step.
+    cell: vec2<f32>,
+    // Metres from the eye to the reference point of the lattice, a point near the eye.
+    offset: vec2<f32>,
+    // Metres of a quantum.
+    quantum: f32,
+    // Metres from the eye up to the reference height, a height near the eye's.
+    up_offset: f32,
+    // Reference height, in quanta.
+    height: i32,
+    // 1 / depth of the deepest point, in metres; 0 where the layer has no sea.
+    per_depth: f32,
+    // The lowest height of land, in metres, and 1 / its range.
+    land_base: f32,
+    per_height: f32,
+    unused: vec2<f32>,
+}
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(1) @binding(0) var<uniform> layer: Layer;
+
+// Metres over which haze thins out to 1/e, going up.
+const HAZE_HEIGHT: f32 = 2500.0;
+
+// The haze between the eye and a point `up` metres above it, `distance` metres away: 0 is none, 1 hides
+// all. Its density falls with height as an exponential, so its integral along the straight line is known.
+fn haze_to(up: f32, distance: f32) -> f32 {
+    let eye = max(frame.sun.w, 0.0) / HAZE_HEIGHT;
+    let point = max(frame.sun.w + up, 0.0) / HAZE_HEIGHT;
+    let rise = point - eye;
+    var density = exp(-eye);
+    if abs(rise) > 1e-3 {
+        density = (density - exp(-point)) / rise;
+    }
+    return 1.0 - exp(-frame.horizon.w * density * distance);
+}
+
+// The light that a surface sends back: the sun, and the sky's half sphere, brighter from above.
+fn lit(albedo: vec3<f32>, normal: vec3<f32>) -> vec3<f32> {
+    let sun = vec3<f32>(1.08, 1.04, 0.97) * max(dot(normal, frame.sun.xyz), 0.0);
+    let sky = vec3<f32>(0.25, 0.28, 0.34) * (0.5 + 0.5 * normal.z);
+    return albedo * (sun + sky);
+}
+
+// A finished colour, as the target wants it.
+fn encoded(linear: vec3<f32>) -> vec4<f32> {
+    let c = clamp(linear, vec3<f32>(0.0), vec3<f32>(1.0));
+    if frame.options.x == 0.0 {
+        return vec4<f32>(c, 1.0);
+    }
+    let curve = 1.055 * pow(c, vec3<f32>(1.0 / 2.4)) - 0.055;
+    return vec4<f32>(select(curve, 12.92 * c, c <= vec3<f32>(0.0031308)), 1.0);
+}

@@ -1,0 +1,23 @@
+// The sky: a gradient by height above the horizon, wherever nothing was drawn.
+
+struct Ray {
+    @builtin(position) clip: vec4<f32>,
+    @location(0) direction: vec3<f32>,
+}
+
+// One triangle that holds the whole picture, infinitely far away: depth is reversed, so that is 0.
+@vertex
+fn sky_vertex(@builtin(vertex_index) index: u32) -> Ray {
+    let x = select(-1.0, 3.0, index == 1u);
+    let y = select(-1.0, 3.0, index == 2u);
+    let direction = frame.forward.xyz + x * frame.right.xyz + y * frame.up.xyz;
+    return Ray(vec4<f32>(x, y, 0.0, 1.0), direction);
+}
+
+@fragment
+fn sky_fragment(ray: Ray) -> @location(0) vec4<f32> {
+    let up = normalize(ray.direction).z;
+    let above = mix(frame.horizon.rgb, frame.zenith.rgb, 1.0 - exp(-4.0 * max(up, 0.0)));
+    // Below the horizon there is haze, darker further down.
+    return encoded(above * mix(1.0, 0.55, smoothstep(0.0, 0.6, -up)));
+}
