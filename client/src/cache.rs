@@ -222,3 +222,89 @@ impl Index {
         }
     }
 }
+
+#[cfg(test)]
+#[allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    reason = "small numbers"
+)]
+mod tests {
+    use super::*;
+    use crate::cut::{Ask, choose};
+    use crate::world::{Dice, any_camera, surfaces, world};
+
+    #[test]
+    fn over_a_random_flight_the_budget_holds_and_no_needed_ancestor_goes() {
+        let built = &world()[0];
+        let forest = built.layer.forest;
+        let all = surfaces(built, |_| true);
+        let size = Surface::bytes(forest.segments());
+        let mut cache = Cache::new(vec![forest], 300 * size + size / 2);
+        let mut dice = Dice(11);
+        let mut evicted = 0;
+        for _ in 0..300 {
+            let camera = any_camera(&mut dice);
+            let ask = Ask { layer: &built.layer, camera: &camera, tolerance_pixels: 0.5, splits_max: 225 };
+            let ideal = choose(&ask, |d| Some(built.entries[&d]));
+            cache.want(ideal.splits().map(|d| (0, d)));
+            let before = cache.len();
+            let mut inserted = 0;
+            for d in ideal.splits() {
+                // Some arrive for a cut that is no longer wanted, some without their parents.
+                let stray = built.diamonds[(dice.roll() * built.diamonds.len() as f64) as usize];
+                inserted +=
+                    usize::from(cache.insert((0, stray), Arc::clone(&all[&stray]), ideal.contains(stray)));
+                if dice.roll() < 0.9 {
+                    inserted += usize::from(cache.insert((0, d), Arc::clone(&all[&d]), true));
+                }
+                assert!(cache.bytes() <= cache.budget_bytes);
+                assert_eq!(cache.bytes(), cache.len() * size);
+            }
+            evicted += before + inserted - cache.len();
+            for (_, d) in cache.held.keys() {
+                assert!(forest.parents(*d).all(|p| cache.get((0, p)).is_some()), "an ancestor is gone");
+            }
+            // What the cut wants, asked for in its order, always finds room, and then all of it is there.
+            for d in ideal.splits() {
+                cache.insert((0, d), Arc::clone(&all[&d]), true);
+            }
+            assert!(ideal.splits().all(|d| cache.get((0, d)).is_some()), "something wanted is gone");
+        }
+        println!("{evicted} surfaces evicted, {} resident", cache.len());
+        assert!(evicted > 1000);
+    }
+
+    #[test]
+    fn roots_stay_however_small_the_budget() {
+        let built = &world()[0];
+        let all = surfaces(built, |d| d.level() < 2);
+        let mut cache = Cache::new(vec![built.layer.forest], 0);
+        for d in built.layer.forest.root_diamonds() {
+            assert!(cache.insert((0, d), Arc::clone(&all[&d]), true));
+        }
+        let child = built.layer.forest.diamonds(1).next().unwrap();
+        assert!(!cache.insert((0, child), Arc::clone(&all[&child]), true));
+        assert_eq!(cache.len(), 2);
+    }
+
+    #[test]
+    fn pages_beyond_the_limit_go_but_not_those_looked_at() {
+        let built = &world()[1];
+        let forest = built.layer.forest;
+        let mut index = Index::new(forest);
+        for page in 0..index::pages(&forest) {
+            let diamonds = index::page_diamonds(&forest, page).unwrap();
+            index.insert(page, diamonds.into_iter().map(|d| (d, built.entries[&d])));
+        }
+        let seen: Vec<Diamond> =
+            built.diamonds.iter().copied().filter(|d| d.level() < 11).take(1500).collect();
+        index.trim(100, seen.iter().copied());
+        assert!(seen.iter().all(|d| index.get(*d) == Some(built.entries[d])));
+        let held = built.diamonds.iter().filter(|d| index.get(**d).is_some()).count();
+        assert_eq!(held, index.entries.len());
+        index.trim(100, std::iter::empty());
+        assert_eq!(index.pages(), 100);
+    }
+}

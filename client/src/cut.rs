@@ -325,11 +325,8 @@ impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
         let bounds = bounds(self.ask.layer, d, &entry);
         let in_view = !entry.is_empty() && bounds.touches(&self.planes);
         let camera = self.ask.camera;
-        let pixels = if in_view {
-            camera.error_pixels(entry.error_metres, bounds.distance(camera.eye))
-        } else {
-            0.0
-        };
+        let pixels =
+            if in_view { camera.error_pixels(entry.error_metres, bounds.distance(camera.eye)) } else { 0.0 };
         // Beyond the picture's height, more error is no worse.
         let priority = pixels.min(f64::from(camera.size[1]));
         let number = u32::try_from(self.ideal.nodes.len()).unwrap_or(NONE);
@@ -442,6 +439,12 @@ fn bounds(layer: &Layer, d: Diamond, entry: &Entry) -> Bounds {
 }
 
 #[cfg(test)]
+#[allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    reason = "small numbers"
+)]
 mod tests {
     use super::*;
     use crate::world::{Built, Dice, above, any_camera, surfaces, world};
@@ -561,7 +564,10 @@ mod tests {
                 let drawing = draw(0, &ask, &ideal, |d| surfaces.get(&d).cloned());
                 let splits: HashSet<Diamond> = ideal.splits().collect();
                 for d in &splits {
-                    assert!(built.layer.forest.parents(*d).all(|p| splits.contains(&p)), "closed under parents");
+                    assert!(
+                        built.layer.forest.parents(*d).all(|p| splits.contains(&p)),
+                        "closed under parents"
+                    );
                 }
                 assert!(!drawing.items.is_empty());
                 if known == 1.0 {
@@ -593,7 +599,8 @@ mod tests {
                     assert!(
                         entry.is_empty()
                             || !bounds.touches(&camera.planes())
-                            || camera.error_pixels(entry.error_metres, bounds.distance(camera.eye)) <= tolerance
+                            || camera.error_pixels(entry.error_metres, bounds.distance(camera.eye))
+                                <= tolerance
                     );
                 }
             }

@@ -110,14 +110,14 @@ pub struct Traffic {
     pub requests: u64,
     /// Requests sent while no other was in flight: how often the network's latency was paid.
     pub round_trips: u64,
-    /// Requests and payloads that failed.
+    /// Requests that failed, in whole or in part.
     pub errors: u64,
     /// Requests dropped because nobody wanted the answer any more.
     pub cancelled: u64,
 }
 
 /// Why something was not fetched.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum FetchError {
     /// Not an address of a server or scene.
     #[error("'{url}' is not the address of a scene ({reason}): expected http://HOST:PORT/scenes/NAME")]
@@ -293,10 +293,10 @@ impl Fetcher {
     }
 
     /// Says that what arrived for `key` was no good. It is fetched again, after a pause.
-    pub fn refuse(&mut self, key: Key, error: FetchError) {
+    pub fn refuse(&mut self, key: Key, error: &FetchError) {
         let mut state = self.shared.lock();
         state.delivered.remove(&key);
-        self.shared.fail(&mut state, key, error);
+        self.shared.fail(&mut state, &[key], error);
     }
 
     /// Whether all that is wished for has failed too often and rests.
@@ -415,7 +415,8 @@ struct Http {
 impl Http {
     async fn get(&self, route: &str) -> Result<Response, FetchError> {
         count(&self.traffic.requests, 1);
-        let response = self.client.get(format!("{}{route}", self.base)).send().await.map_err(transport)?;
+        let response =
+            self.client.get(format!("{}{route}", self.base)).send().await.map_err(|e| transport(&e))?;
         if response.status() == StatusCode::OK {
             return Ok(response);
         }
@@ -428,7 +429,7 @@ impl Http {
     }
 
     async fn chunk(&self, response: &mut Response) -> Result<Option<Bytes>, FetchError> {
-        let chunk = response.chunk().await.map_err(transport)?;
+        let chunk = response.chunk().await.map_err(|e| transport(&e))?;
         count(&self.traffic.bytes, chunk.as_ref().map_or(0, Bytes::len));
         Ok(chunk)
     }
@@ -482,9 +483,9 @@ fn only(mut catalogue: Catalogue) -> Result<Scene, FetchError> {
 }
 
 /// The error with its causes: the outermost one alone says nothing.
-fn transport(error: reqwest::Error) -> FetchError {
+fn transport(error: &reqwest::Error) -> FetchError {
     let mut text = error.to_string();
-    let mut cause = std::error::Error::source(&error);
+    let mut cause = std::error::Error::source(error);
     while let Some(next) = cause {
         text = format!("{text}: {next}");
         cause = next.source();
@@ -671,41 +672,48 @@ impl Shared {
                 let mut owed: HashMap<[u32; 2], (Diamond, Option<u32>)> =
                     wants.iter().map(|want| (want.0.centre(), *want)).collect();
                 let mut frames = Frames::default();
+                let mut bad = None;
                 while let Some(chunk) = self.http.chunk(&mut response).await? {
                     frames.push(&chunk);
                     while let Some((header, payload)) = frames.take()? {
                         let centre = header.centre;
                         let (d, bytes) = owed.remove(&centre).ok_or(FetchError::Unasked(centre))?;
-                        self.receive(*layer, d, bytes, &header, payload);
+                        // A bad payload is still owed; the others are none the worse.
+                        bad = self.receive(*layer, d, bytes, &header, payload).err().or(bad);
                     }
                 }
-                if owed.is_empty() { Ok(()) } else { Err(FetchError::Early(shortened(&route))) }
+                match bad {
+                    Some(error) => Err(error),
+                    None if owed.is_empty() => Ok(()),
+                    None => Err(FetchError::Early(shortened(&route))),
+                }
             }
         }
     }
 
-    /// Takes one payload of a batch.
-    fn receive(&self, layer: usize, d: Diamond, bytes: Option<u32>, header: &FrameHeader, payload: Bytes) {
-        let key = Key::Diamond(layer, d);
-        let good = match header.status {
-            Status::Ok => {
-                header.checksum == message::checksum(&payload) && bytes.is_none_or(|b| b == header.length)
+    /// Takes one payload of a batch, and hands it on if it is good.
+    fn receive(
+        &self,
+        layer: usize,
+        d: Diamond,
+        bytes: Option<u32>,
+        header: &FrameHeader,
+        payload: Bytes,
+    ) -> Result<(), FetchError> {
+        match header.status {
+            Status::Ok if header.checksum != message::checksum(&payload) => {
+                return Err(FetchError::Damaged(d.centre()));
+            }
+            Status::Ok if bytes.is_some_and(|b| b != header.length) => {
+                return Err(FetchError::Damaged(d.centre()));
             }
             // The index was not there to tell that there is none.
-            Status::Missing => bytes.is_none() && header.length == 0,
-            Status::Damaged => false,
-        };
-        if good {
-            self.deliver(key, Event::Payload(layer, d, payload));
-        } else {
-            let error = match header.status {
-                Status::Ok => FetchError::Damaged(d.centre()),
-                Status::Missing | Status::Damaged => FetchError::Missing(d.centre()),
-            };
-            let mut state = self.lock();
-            state.flying.remove(&key);
-            self.fail(&mut state, key, error);
+            Status::Missing if bytes.is_none() && header.length == 0 => {}
+            Status::Missing | Status::Damaged => return Err(FetchError::Missing(d.centre())),
+            Status::Ok => {}
         }
+        self.deliver(Key::Diamond(layer, d), Event::Payload(layer, d, payload));
+        Ok(())
     }
 
     fn deliver(&self, key: Key, event: Event) {
@@ -723,20 +731,29 @@ impl Shared {
         let _ = self.sender.send((serial, event));
     }
 
-    /// Puts a wish off, and reports it if it has failed too often.
-    fn fail(&self, state: &mut State, key: Key, error: FetchError) {
+    /// Puts wishes that failed together off, and reports those that have failed too often. One pause serves
+    /// them all, or else a batch that failed would come back as many.
+    fn fail(&self, state: &mut State, keys: &[Key], error: &FetchError) {
         count(&self.http.traffic.errors, 1);
-        let asked = if let FetchError::Status { retry_after, .. } = &error { *retry_after } else { None };
+        let asked = if let FetchError::Status { retry_after, .. } = error { *retry_after } else { None };
+        let tries = |key: &Key| state.failures.get(key).map_or(0, |failure| failure.tries);
         let now = Instant::now();
+        let again = now + pause(1 + keys.iter().map(tries).max().unwrap_or(0), asked);
+        for key in keys {
+            self.fail_one(state, *key, error, now, again);
+        }
+    }
+
+    fn fail_one(&self, state: &mut State, key: Key, error: &FetchError, now: Instant, again: Instant) {
         let failure = state.failures.entry(key).or_insert(Failure { tries: 0, not_before: now });
         // A wish that has rested rests again at once.
         failure.tries = (failure.tries + 1).min(TRIES_MAX);
         let rest = failure.tries == TRIES_MAX;
-        failure.not_before = now + if rest { REST } else { pause(failure.tries, asked) };
+        failure.not_before = if rest { now + REST } else { again };
         if rest {
             state.serial += 1;
             // As above.
-            let _ = self.sender.send((state.serial, Event::Failed(key, error)));
+            let _ = self.sender.send((state.serial, Event::Failed(key, error.clone())));
         }
     }
 
@@ -761,9 +778,7 @@ impl Shared {
                 }
             }
             Some(Err(error)) => {
-                for key in owed.into_iter().rev() {
-                    self.fail(&mut state, key, error.again());
-                }
+                self.fail(&mut state, &owed, &error);
             }
         }
         drop(state);
@@ -788,18 +803,6 @@ impl Shared {
             state.serial += 1;
             // As above.
             let _ = self.sender.send((state.serial, Event::SceneChanged));
-        }
-    }
-}
-
-impl FetchError {
-    /// The same in short, for each wish of a request that failed.
-    fn again(&self) -> Self {
-        match self {
-            Self::Status { route, status, retry_after } => {
-                Self::Status { route: route.clone(), status: *status, retry_after: *retry_after }
-            }
-            other => Self::Transport(other.to_string()),
         }
     }
 }
@@ -871,5 +874,193 @@ impl Frames {
         let payload = Bytes::copy_from_slice(&self.buffer[..length]);
         self.buffer.advance(length);
         Ok(self.header.take().map(|header| (header, payload)))
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::cast_possible_truncation, reason = "small numbers")]
+mod tests {
+    use super::*;
+    use crate::world::{Faults, Served, scene, world};
+
+    #[test]
+    fn addresses_of_servers_and_scenes_are_told_apart() {
+        let parse = |text| parse_address(text).map(|(url, name)| (url.to_string(), name));
+        let at = |base: &str, name: Option<&str>| (base.to_owned(), name.map(str::to_owned));
+        assert_eq!(parse("http://h:80/").unwrap(), at("http://h/", None));
+        assert_eq!(parse("http://h:8080").unwrap(), at("http://h:8080/", None));
+        assert_eq!(parse("http://h/scenes").unwrap(), at("http://h/", None));
+        assert_eq!(parse("http://h/scenes/alps/").unwrap(), at("http://h/", Some("alps")));
+        assert_eq!(parse("http://h/deep/scenes/alps?x#y").unwrap(), at("http://h/deep", Some("alps")));
+        for bad in ["", "h:80", "ftp://h/", "https://h/", "http://h/scenes/a/b/c", "http://h/scenes/.x"] {
+            assert!(matches!(parse(bad), Err(FetchError::Address { .. })), "{bad}");
+        }
+    }
+
+    #[test]
+    fn frames_come_out_whole_wherever_the_stream_is_cut() {
+        let payloads: Vec<Vec<u8>> = (0..40usize).map(|i| vec![i as u8; i * i]).collect();
+        let mut stream = Vec::new();
+        for (i, payload) in payloads.iter().enumerate() {
+            FrameHeader::of([i as u32, 300], payload).write(&mut stream);
+            stream.extend(payload);
+        }
+        for size in [1, 2, 7, 100, 5000, stream.len()] {
+            let mut frames = Frames::default();
+            let mut found = Vec::new();
+            for chunk in stream.chunks(size) {
+                frames.push(chunk);
+                while let Some((header, payload)) = frames.take().unwrap() {
+                    assert_eq!(header.checksum, message::checksum(&payload));
+                    found.push(payload.to_vec());
+                }
+            }
+            assert_eq!(found, payloads);
+        }
+    }
+
+    #[test]
+    fn absurd_frames_are_refused_before_their_bytes_are_awaited() {
+        let mut bytes = Vec::new();
+        FrameHeader { length: u32::MAX, ..FrameHeader::of([1, 1], &[]) }.write(&mut bytes);
+        bytes.resize(message::FRAME_HEADER_BYTES_MAX, 0);
+        let mut frames = Frames::default();
+        frames.push(&bytes);
+        assert!(frames.take().is_err());
+    }
+
+    #[test]
+    fn scenes_with_impossible_numbers_are_refused() {
+        assert_eq!(check(&scene(2)), Ok(()));
+        let with = |change: &dyn Fn(&mut Scene)| {
+            let mut scene = scene(2);
+            change(&mut scene);
+            check(&scene)
+        };
+        assert!(with(&|s| s.layers.clear()).is_err());
+        assert!(with(&|s| s.version = "../x".into()).is_err());
+        assert!(with(&|s| s.layers[1].name = "a/b".into()).is_err());
+        assert!(with(&|s| s.layers[0].quantum = 0.0).is_err());
+        assert!(with(&|s| s.layers[0].cell[1] = f64::NAN).is_err());
+        assert!(with(&|s| s.layers[0].origin[1] = 1e300).is_err());
+        assert!(with(&|s| s.layers[0].coding = s.layers[1].coding.clone()).is_err());
+    }
+
+    #[test]
+    fn several_scenes_are_listed() {
+        let catalogue =
+            Catalogue { scenes: ["a", "b"].map(|name| Scene { name: name.into(), ..scene(1) }).to_vec() };
+        let text = only(catalogue).unwrap_err().to_string();
+        assert!(text.ends_with("a, b"), "{text}");
+        assert!(only(Catalogue { scenes: Vec::new() }).is_err());
+    }
+
+    #[test]
+    fn pauses_double_within_bounds() {
+        for tries in 1..40 {
+            let paused = pause(tries, None);
+            let least = PAUSE.saturating_mul(1 << (tries - 1).min(12)).min(PAUSE_MAX);
+            assert!(paused >= least && paused <= (least * 2).min(PAUSE_MAX), "{tries}: {paused:?}");
+        }
+        assert_eq!(pause(1, Some(Duration::from_secs(3600))), PAUSE_MAX);
+        assert_eq!(pause(1, Some(Duration::from_secs(2))), Duration::from_secs(2));
+    }
+
+    fn wants(level: u32) -> Vec<Want> {
+        let built = &world()[0];
+        let diamonds = built.layer.forest.diamonds(level).filter(|d| built.entries[d].bytes > 0);
+        diamonds.map(|d| Want { key: Key::Diamond(0, d), bytes: Some(built.entries[&d].bytes) }).collect()
+    }
+
+    /// Events until `count` have come or some seconds have passed.
+    fn events(fetcher: &mut Fetcher, count: usize) -> Vec<Event> {
+        let until = Instant::now() + Duration::from_secs(20);
+        let mut list = Vec::new();
+        while list.len() < count && Instant::now() < until {
+            match fetcher.poll() {
+                Some(event) => list.push(event),
+                None => std::thread::sleep(Duration::from_millis(1)),
+            }
+        }
+        list
+    }
+
+    #[test]
+    fn what_arrived_is_not_fetched_again_until_it_is_wished_for_knowingly() {
+        let served = Served::start(1, Faults::default());
+        let (mut fetcher, _) = Fetcher::open(&served.url, Options::default()).unwrap();
+        let wants = wants(4);
+        fetcher.wish(wants.clone());
+        // Wishes by an author who has not looked at the arrivals yet.
+        for _ in 0..100 {
+            fetcher.wish(wants.clone());
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        assert_eq!(fetcher.traffic().requests, 2, "the scene and one batch");
+        let arrived = events(&mut fetcher, wants.len());
+        for (want, event) in wants.iter().zip(&arrived) {
+            let Event::Payload(0, d, payload) = event else { panic!("{event:?}") };
+            assert_eq!(Key::Diamond(0, *d), want.key, "in the order of the wishes");
+            assert_eq!(payload, &world()[0].payloads[d]);
+        }
+        fetcher.wish(wants[..3].to_vec());
+        assert_eq!(events(&mut fetcher, 3).len(), 3, "now its author means it");
+        assert_eq!(fetcher.traffic().round_trips, 3);
+    }
+
+    #[test]
+    fn requests_that_nobody_wants_any_more_are_dropped() {
+        let served = Served::start(1, Faults { slow: 1.0, ..Faults::default() });
+        let (mut fetcher, _) = Fetcher::open(&served.url, Options::default()).unwrap();
+        fetcher.wish(wants(9));
+        std::thread::sleep(Duration::from_millis(200));
+        let flights = fetcher.shared.lock().flights.len();
+        assert!(flights > 1);
+        fetcher.wish(Vec::new());
+        std::thread::sleep(Duration::from_millis(200));
+        assert_eq!(fetcher.shared.lock().flights.len(), 0);
+        assert!(fetcher.shared.lock().flying.is_empty());
+        assert_eq!(fetcher.traffic().cancelled, flights as u64);
+    }
+
+    #[test]
+    fn batches_stay_within_their_limits() {
+        let served = Served::start(1, Faults::default());
+        let (mut fetcher, _) = Fetcher::open(&served.url, Options::default()).unwrap();
+        // The server of the tests panics, and so answers nothing, where a batch is too long.
+        let wants = wants(9);
+        fetcher.wish(wants.clone());
+        assert_eq!(events(&mut fetcher, wants.len()).len(), wants.len());
+        let requests = fetcher.traffic().requests as usize - 1;
+        assert!(requests >= wants.len().div_ceil(message::BATCH_MAX) && requests <= 2 + wants.len() / 200);
+        assert_eq!(fetcher.traffic().errors, 0);
+    }
+
+    #[test]
+    fn a_wish_that_keeps_failing_is_reported_and_rests() {
+        let served = Served::start(1, Faults { status_500: 1.0, ..Faults::default() });
+        let (mut fetcher, _) = Fetcher::open(&served.url, Options::default()).unwrap();
+        fetcher.wish(vec![wants(4)[0], Want { key: Key::Page(0, 0), bytes: None }]);
+        let reported = events(&mut fetcher, 2);
+        assert!(reported.iter().all(|event| matches!(event, Event::Failed(..))), "{reported:?}");
+        std::thread::sleep(Duration::from_millis(300));
+        assert!(fetcher.is_stuck());
+        assert_eq!(fetcher.traffic().requests, 1 + 2 * u64::from(TRIES_MAX));
+    }
+
+    #[test]
+    fn a_page_that_is_a_bomb_is_refused() {
+        let served = Served::start(1, Faults { bomb: 1.0, ..Faults::default() });
+        let (mut fetcher, _) = Fetcher::open(&served.url, Options::default()).unwrap();
+        fetcher.wish(vec![Want { key: Key::Page(0, 0), bytes: None }]);
+        let reported = events(&mut fetcher, 1);
+        let [Event::Failed(Key::Page(0, 0), error)] = reported.as_slice() else { panic!("{reported:?}") };
+        assert!(error.to_string().contains("does not decompress"), "{error}");
+    }
+
+    #[test]
+    fn no_server_is_said_plainly() {
+        let error = Fetcher::open("http://127.0.0.1:9", Options::default()).unwrap_err().to_string();
+        assert!(error.contains("is the server running"), "{error}");
     }
 }

@@ -182,7 +182,8 @@ impl Terrain {
         }
         let opened = Instant::now();
         let (fetcher, scene) = Fetcher::open(url, options.fetch)?;
-        let unfit = |layer: &&Layer| options.encoding != ENCODING || !layer.encodings.iter().any(|e| e == ENCODING);
+        let unfit =
+            |layer: &&Layer| options.encoding != ENCODING || !layer.encodings.iter().any(|e| e == ENCODING);
         if let Some(layer) = scene.layers.iter().find(unfit) {
             return Err(TerrainError::Encoding {
                 layer: layer.name.clone(),
@@ -313,7 +314,7 @@ impl Terrain {
                 }
                 Err(error) => {
                     tracing::debug!(%error, centre = ?d.centre(), "payload refused");
-                    self.fetcher.refuse(fetch::Key::Diamond(number, d), FetchError::Damaged(d.centre()));
+                    self.fetcher.refuse(fetch::Key::Diamond(number, d), &FetchError::Damaged(d.centre()));
                 }
             }
         }
@@ -570,5 +571,185 @@ impl Bench {
             jobs.ready.push_back((child, job));
             self.changed.notify_one();
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::world::{Dice, Faults, Served, above, any_camera};
+    use glam::DVec3;
+
+    const MINUTE: Duration = Duration::from_secs(60);
+
+    fn open(served: &Served, options: Options) -> Terrain {
+        Terrain::open(&served.url, options).unwrap()
+    }
+
+    #[test]
+    fn settling_reaches_the_asked_error_in_few_round_trips() {
+        for layers in [1, 2] {
+            let served = Served::start(layers, Faults::default());
+            let mut terrain = open(&served, Options::default());
+            let camera = above();
+            let view = terrain.settle(&camera, MINUTE);
+            assert!(view.complete && view.error_pixels <= 1.0, "{view:?}");
+            assert_eq!(view.error_pixels, view.error_pixels_goal);
+            let stats = view.stats;
+            println!("{layers} layers: {stats:?}");
+            assert!(stats.traffic.round_trips <= 4, "scene, roots with their pages, deeper pages, the rest");
+            assert!(stats.traffic.errors == 0 && stats.failed == 0 && stats.decoding == 0);
+            assert!(stats.points_real > 0 && stats.points_fictitious > 0);
+            assert!(stats.first_picture_seconds <= stats.asked_error_seconds);
+            assert_eq!(view.items.iter().map(|item| item.layer).max(), Some(layers - 1));
+            // Nothing moves, so nothing more is asked for.
+            let again = terrain.frame(&camera);
+            assert_eq!(again.stats.traffic.requests, stats.traffic.requests);
+        }
+    }
+
+    #[test]
+    fn from_the_first_picture_on_something_is_always_drawn_and_it_gets_better() {
+        let served = Served::start(2, Faults { slow: 0.5, ..Faults::default() });
+        let mut terrain = open(&served, Options::default());
+        let camera = above();
+        let until = Instant::now() + MINUTE;
+        let mut last = f64::INFINITY;
+        let mut pictures = 0;
+        while Instant::now() < until {
+            let view = terrain.frame(&camera);
+            assert!(view.error_pixels <= last, "a still camera's picture never gets worse");
+            assert!(view.error_pixels.is_finite() || pictures == 0);
+            pictures += usize::from(view.error_pixels < last);
+            last = view.error_pixels;
+            if view.complete {
+                break;
+            }
+            std::thread::sleep(Duration::from_millis(3));
+        }
+        println!("{pictures} pictures, each with less error");
+        assert!(last <= 1.0 && pictures > 2);
+    }
+
+    #[test]
+    fn a_flight_in_little_memory_stays_within_it_and_never_shows_nothing() {
+        let served = Served::start(1, Faults::default());
+        let memory_bytes = 400 * Surface::bytes(16);
+        let mut terrain = open(&served, Options { memory_bytes, ..Options::default() });
+        terrain.settle(&above(), MINUTE);
+        let mut dice = Dice(5);
+        for _ in 0..25 {
+            let (from, to) = (any_camera(&mut dice), any_camera(&mut dice));
+            for step in 0..20 {
+                let eye = from.eye.lerp(to.eye, f64::from(step) / 20.0);
+                let target = DVec3::new(505_000.0, 4_002_000.0, 100.0);
+                let view = terrain.frame(&Camera { eye, target, ..from });
+                assert!(!view.items.is_empty());
+                assert!(view.stats.resident_bytes <= memory_bytes);
+                assert!(view.stats.frame_seconds < 0.05, "{}", view.stats.frame_seconds);
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        }
+        let view = terrain.settle(&above(), MINUTE);
+        assert!(view.complete && view.stats.splits_drawn <= 300);
+        assert_eq!(view.error_pixels, view.error_pixels_goal, "the best that the memory allows");
+    }
+
+    /// Streams from a server that misbehaves; the view at the end, and the longest frame.
+    fn endure(faults: Faults, seconds: u64) -> (FrameView, f64, Option<String>) {
+        let served = Served::start(2, faults);
+        let patience = Duration::from_millis(500);
+        let fetch = fetch::Options { patience, ..fetch::Options::default() };
+        let mut terrain = open(&served, Options { fetch, ..Options::default() });
+        let until = Instant::now() + Duration::from_secs(seconds);
+        let mut longest = 0.0f64;
+        loop {
+            let started = Instant::now();
+            let view = terrain.frame(&above());
+            longest = longest.max(started.elapsed().as_secs_f64());
+            if view.complete || Instant::now() > until {
+                println!("{faults:?}: {:.1} ms at most, {:?}", longest * 1e3, view.stats.traffic);
+                return (view, longest, terrain.problem().map(str::to_owned));
+            }
+            std::thread::sleep(Duration::from_millis(3));
+        }
+    }
+
+    #[test]
+    fn a_server_that_misbehaves_now_and_then_is_endured_without_a_slow_frame() {
+        let some = 0.25;
+        let faults = [
+            Faults { status_500: some, ..Faults::default() },
+            Faults { truncated: some, ..Faults::default() },
+            Faults { damaged: some / 5.0, ..Faults::default() },
+            Faults { silent: some, ..Faults::default() },
+            Faults { absurd: some / 20.0, ..Faults::default() },
+            Faults { garbage: some, ..Faults::default() },
+            Faults { bomb: some, ..Faults::default() },
+        ];
+        std::thread::scope(|scope| {
+            for faults in faults {
+                scope.spawn(move || {
+                    // Room for wishes that were unlucky five times and rest.
+                    let (view, longest, problem) = endure(faults, 60);
+                    assert!(view.complete && view.error_pixels <= 1.0, "{faults:?} {problem:?}");
+                    assert!(longest < 0.05, "{longest} s {faults:?}");
+                });
+            }
+        });
+    }
+
+    #[test]
+    fn a_server_that_always_misbehaves_is_reported_without_a_slow_frame() {
+        let faults = [
+            Faults { status_500: 1.0, ..Faults::default() },
+            Faults { damaged: 1.0, ..Faults::default() },
+            Faults { garbage: 1.0, ..Faults::default() },
+            Faults { bomb: 1.0, ..Faults::default() },
+            Faults { silent: 1.0, ..Faults::default() },
+        ];
+        std::thread::scope(|scope| {
+            for faults in faults {
+                scope.spawn(move || {
+                    let (view, longest, problem) = endure(faults, 9);
+                    assert!(!view.complete && view.stats.failed > 0 && problem.is_some(), "{faults:?}");
+                    assert!(longest < 0.05, "{longest} s {faults:?}");
+                    assert_eq!(view.items.is_empty(), faults.bomb == 0.0, "roots alone make a picture");
+                });
+            }
+        });
+    }
+
+    #[test]
+    fn settling_ends_early_where_nothing_more_can_come() {
+        let served = Served::start(1, Faults { status_500: 0.0, ..Faults::default() });
+        let mut terrain = open(&served, Options::default());
+        served.misbehave(Faults { status_500: 1.0, ..Faults::default() });
+        let started = Instant::now();
+        let view = terrain.settle(&above(), MINUTE);
+        assert!(!view.complete && started.elapsed() < Duration::from_secs(15));
+        assert!(terrain.problem().unwrap().contains("500"));
+    }
+
+    #[test]
+    fn a_new_version_of_the_scene_is_noticed_and_the_picture_stays() {
+        let served = Served::start(1, Faults::default());
+        let mut terrain = open(&served, Options { tolerance_pixels: 20.0, ..Options::default() });
+        let view = terrain.settle(&above(), MINUTE);
+        assert!(view.complete && !terrain.scene_changed());
+        served.misbehave(Faults { gone: true, ..Faults::default() });
+        terrain.set_tolerance_pixels(1.0);
+        let view = terrain.settle(&above(), MINUTE);
+        assert!(terrain.scene_changed() && !view.items.is_empty() && !view.complete);
+    }
+
+    #[test]
+    fn wrong_options_are_refused() {
+        let served = Served::start(1, Faults::default());
+        let tin = Options { encoding: "tin".into(), ..Options::default() };
+        let error = Terrain::open(&served.url, tin).unwrap_err().to_string();
+        assert!(error.contains("'tin'") && error.contains("points"), "{error}");
+        let zero = Options { tolerance_pixels: 0.0, ..Options::default() };
+        assert!(matches!(Terrain::open(&served.url, zero), Err(TerrainError::Tolerance(_))));
     }
 }

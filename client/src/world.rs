@@ -51,8 +51,8 @@ pub(crate) fn world() -> &'static [Built] {
     static WORLD: OnceLock<Vec<Built>> = OnceLock::new();
     WORLD.get_or_init(|| {
         vec![
-            build("terrain", Kind::Terrain, Forest::new(9, 3, [2, 1]).unwrap(), [10.0, 10.0], hills),
-            build("water", Kind::Water, Forest::new(8, 3, [1, 1]).unwrap(), [20.0, 20.0], pond),
+            build("terrain", Kind::Terrain, Forest::new(9, 4, [2, 1]).unwrap(), [10.0, 10.0], hills),
+            build("water", Kind::Water, Forest::new(9, 3, [1, 1]).unwrap(), [10.0, 10.0], pond),
         ]
     })
 }
@@ -156,10 +156,7 @@ fn entry(before: &Block, after: &Block, source: &Block, root: bool, quantum: f64
 }
 
 /// The surface of each diamond that has all its ancestors among `wanted`, decoded.
-pub(crate) fn surfaces(
-    built: &Built,
-    wanted: impl Fn(Diamond) -> bool,
-) -> HashMap<Diamond, Arc<Surface>> {
+pub(crate) fn surfaces(built: &Built, wanted: impl Fn(Diamond) -> bool) -> HashMap<Diamond, Arc<Surface>> {
     let mut surfaces: HashMap<Diamond, Arc<Surface>> = HashMap::new();
     for d in built.diamonds.iter().copied().filter(|d| wanted(*d)) {
         let parents: Option<Vec<_>> =
