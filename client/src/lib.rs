@@ -1,7 +1,28 @@
 //! Draws streamed terrain.
+//!
+//! | module | what it holds |
+//! |---|---|
+//! | [`camera`] | the eye; how large a metre looks |
+//! | [`cut`] | camera and resident diamonds → what to draw and what to ask for |
+//! | [`fetch`] | requests by priority, retried, cancellable; answers as they stream in |
+//! | [`cache`] | decoded diamonds under a byte budget |
+//! | [`surface`] | a decoded diamond: heights and slopes |
+//! | [`terrain`] | one frame of streaming: cut, fetch, decode, cache |
+//! | [`drawing`] | what a frame draws, as plain data |
+//! | [`render`] | drawing + camera → pixels; the only module that knows the GPU |
+//! | [`picture`] | pixels → PNG |
+//! | [`headless`] | pictures and flights without a window |
 
+pub mod cache;
 pub mod camera;
+pub mod cut;
 pub mod drawing;
+pub mod fetch;
+pub mod headless;
 pub mod picture;
 pub mod render;
 pub mod surface;
+pub mod terrain;
+
+#[cfg(test)]
+mod world;

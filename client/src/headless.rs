@@ -1,0 +1,523 @@
+//! Pictures and flights without a window.
+
+use crate::camera::{Camera, FOV_Y};
+use crate::picture::{Picture, write_png};
+use crate::render::{self, FrameStats, Look, Offscreen, RenderError};
+use crate::terrain::{FrameView, Stats, Terrain, TerrainError};
+use diamantina_protocol::message::Scene;
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// Most key frames of a path.
+const KEYS_MAX: usize = 100_000;
+
+/// The largest file with a path, in bytes.
+const PATH_BYTES_MAX: u64 = 64 << 20;
+
+/// Why there is no picture or flight.
+#[derive(Debug, thiserror::Error)]
+pub enum HeadlessError {
+    /// The scene cannot be streamed.
+    #[error(transparent)]
+    Terrain(#[from] TerrainError),
+    /// It cannot be drawn.
+    #[error(transparent)]
+    Render(#[from] RenderError),
+    /// A file cannot be written or read.
+    #[error("{path}: cannot {action}: {error}")]
+    File {
+        /// What was being done.
+        action: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        error: std::io::Error,
+    },
+    /// The path makes no sense.
+    #[error(
+        "{path}: not a path: {what}; expected {{\"keys\": [{{\"seconds\": 0, \"eye\": [x, y, z], \"target\": [x, y, z]}}, ...]}} with rising seconds"
+    )]
+    Path {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        what: String,
+    },
+}
+
+fn file_error<'a>(action: &'static str, path: &'a Path) -> impl Fn(std::io::Error) -> HeadlessError + 'a {
+    move |error| HeadlessError::File { action, path: path.to_owned(), error }
+}
+
+/// The box around a scene, in frame coordinates and metres: south-west-lowest and north-east-highest.
+#[must_use]
+pub fn extent(scene: &Scene) -> [DVec3; 2] {
+    let boxes = scene.layers.iter().map(|l| {
+        let [x0, y0] = l.origin;
+        let [x1, y1] = l.position(l.samples.map(|s| s - 1));
+        [DVec3::new(x0, y0, l.heights[0]), DVec3::new(x1, y1, l.heights[1])]
+    });
+    boxes.reduce(|[a, b], [c, d]| [a.min(c), b.max(d)]).unwrap_or([DVec3::ZERO, DVec3::ONE])
+}
+
+/// A camera that sees a whole scene, from the south and above.
+#[must_use]
+pub fn overview(scene: &Scene, size: [u32; 2]) -> Camera {
+    let [low, high] = extent(scene);
+    let centre = (low + high) / 2.0;
+    let radius = (high - low).truncate().length() / 2.0;
+    let aspect = f64::from(size[0].max(1)) / f64::from(size[1].max(1));
+    // Far enough that the ground's circle fits the narrower side of the view.
+    let narrow = ((FOV_Y / 2.0).tan() * aspect.min(1.35)).atan();
+    let distance = radius / narrow.sin() * 0.86;
+    let tilt = 38f64.to_radians();
+    let eye = centre + DVec3::new(0.0, -tilt.cos(), tilt.sin()) * distance;
+    Camera { eye, target: centre, fov_y: FOV_Y, size }
+}
+
+/// Numbers about a picture.
+#[derive(Debug, Clone, Serialize)]
+pub struct PictureReport {
+    /// The scene.
+    pub scene: String,
+    /// Its version.
+    pub version: String,
+    /// The camera's eye, in the frame's metres.
+    pub eye: [f64; 3],
+    /// What the camera looks at.
+    pub target: [f64; 3],
+    /// Width and height, in pixels.
+    pub size: [u32; 2],
+    /// Bytes of all answers.
+    pub bytes: u64,
+    /// Requests sent.
+    pub requests: u64,
+    /// Requests sent while no other was in flight.
+    pub round_trips: u64,
+    /// Points received: real, deduced, corrected.
+    pub points_received: u64,
+    /// New points whose height was sent.
+    pub real_points: u64,
+    /// New points whose height was deduced.
+    pub fictitious_points: u64,
+    /// Older points that were made more precise.
+    pub corrected_points: u64,
+    /// Triangles drawn.
+    pub triangles_drawn: u64,
+    /// Draw calls.
+    pub draws: u32,
+    /// Seconds until something could be drawn.
+    pub seconds_to_first_picture: Option<f64>,
+    /// Seconds until the asked error was reached.
+    pub seconds_to_asked_error: Option<f64>,
+    /// The asked error, in pixels.
+    pub asked_error_pixels: f64,
+    /// The largest error of what is drawn, in pixels, from the declared errors.
+    pub largest_error_pixels: f64,
+    /// Whether all that was wanted arrived.
+    pub complete: bool,
+    /// Milliseconds to draw the finished picture.
+    pub milliseconds_a_frame: f64,
+}
+
+/// Streams until the camera's view is as exact as asked, and draws it. Gives up waiting after `patience`
+/// and draws what is there.
+///
+/// # Errors
+/// When there is no graphics adapter.
+pub fn picture(
+    terrain: &mut Terrain,
+    camera: &Camera,
+    look: &Look,
+    options: &render::Options,
+    patience: Duration,
+) -> Result<(Picture, PictureReport), HeadlessError> {
+    let mut offscreen = Offscreen::new(options)?;
+    let view = terrain.settle(camera, patience);
+    let layers = &terrain.scene().layers;
+    offscreen.draw(layers, camera, &view.items, look)?;
+    offscreen.read()?;
+    // Everything is uploaded by now: this is what a frame costs.
+    let started = Instant::now();
+    let frame = offscreen.draw(layers, camera, &view.items, look)?;
+    let picture = offscreen.read()?;
+    let milliseconds_a_frame = started.elapsed().as_secs_f64() * 1e3;
+    let report = report(terrain, camera, &view, frame, milliseconds_a_frame);
+    Ok((picture, report))
+}
+
+fn report(
+    terrain: &Terrain,
+    camera: &Camera,
+    view: &FrameView,
+    frame: FrameStats,
+    milliseconds_a_frame: f64,
+) -> PictureReport {
+    let Stats { traffic, .. } = view.stats;
+    PictureReport {
+        scene: terrain.scene().name.clone(),
+        version: terrain.scene().version.clone(),
+        eye: camera.eye.to_array(),
+        target: camera.target.to_array(),
+        size: camera.size,
+        bytes: traffic.bytes,
+        requests: traffic.requests,
+        round_trips: traffic.round_trips,
+        points_received: view.stats.points_real + view.stats.points_fictitious,
+        real_points: view.stats.points_real,
+        fictitious_points: view.stats.points_fictitious,
+        corrected_points: view.stats.points_corrected,
+        triangles_drawn: frame.triangles,
+        draws: frame.draws,
+        seconds_to_first_picture: view.stats.first_picture_seconds,
+        seconds_to_asked_error: view.stats.asked_error_seconds,
+        asked_error_pixels: terrain.tolerance_pixels(),
+        largest_error_pixels: view.error_pixels,
+        complete: view.complete,
+        milliseconds_a_frame,
+    }
+}
+
+/// Writes a picture as PNG.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn save(picture: &Picture, path: &Path) -> Result<(), HeadlessError> {
+    let failed = file_error("write the picture", path);
+    let file = File::create(path).map_err(&failed)?;
+    write_png(picture, BufWriter::new(file)).map_err(|e| failed(std::io::Error::other(e)))
+}
+
+/// A path through a scene: eyes and targets at moments.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FlightPath {
+    /// Moments, in rising order.
+    pub keys: Vec<PathKey>,
+}
+
+/// The camera at a moment.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PathKey {
+    /// Seconds from the start.
+    pub seconds: f64,
+    /// The eye, in the frame's metres.
+    pub eye: [f64; 3],
+    /// What the camera looks at.
+    pub target: [f64; 3],
+}
+
+impl FlightPath {
+    /// Reads a path from a JSON file.
+    ///
+    /// # Errors
+    /// When the file cannot be read or holds no path.
+    pub fn read(path: &Path) -> Result<Self, HeadlessError> {
+        let wrong = |what: String| HeadlessError::Path { path: path.to_owned(), what };
+        let bytes = std::fs::metadata(path).map_err(file_error("read", path))?.len();
+        if bytes > PATH_BYTES_MAX {
+            return Err(wrong(format!("{bytes} bytes, limit {PATH_BYTES_MAX}")));
+        }
+        let text = std::fs::read(path).map_err(file_error("read", path))?;
+        let flight: Self = serde_json::from_slice(&text).map_err(|e| wrong(e.to_string()))?;
+        if flight.keys.is_empty() || flight.keys.len() > KEYS_MAX {
+            return Err(wrong(format!("{} keys, expected 1 to {KEYS_MAX}", flight.keys.len())));
+        }
+        if !flight.keys.is_sorted_by(|a, b| a.seconds < b.seconds) {
+            return Err(wrong("its seconds do not rise".to_owned()));
+        }
+        if flight.keys.iter().any(|k| k.eye == k.target) {
+            return Err(wrong("an eye is its own target".to_owned()));
+        }
+        Ok(flight)
+    }
+
+    /// A round over a scene: in from the overview, across it low, and out.
+    #[must_use]
+    pub fn round(scene: &Scene) -> Self {
+        let [low, high] = extent(scene);
+        let centre = (low + high) / 2.0;
+        let span = high - low;
+        let far = overview(scene, [16, 9]);
+        let keys = (0..=12).map(|i| {
+            let part = f64::from(i) / 12.0;
+            let angle = part * std::f64::consts::TAU - std::f64::consts::FRAC_PI_2;
+            // 0 at both ends, 1 in the middle: how far in.
+            let near = (part * std::f64::consts::PI).sin();
+            let around = DVec3::new(angle.cos() * span.x, angle.sin() * span.y, 0.0) * (0.9 - 0.65 * near);
+            let height = high.z + (far.eye.z - high.z) * (1.0 - near) + span.truncate().length() * 0.03;
+            let eye = if i % 12 == 0 { far.eye } else { (centre + around).with_z(height) };
+            PathKey {
+                seconds: f64::from(i) * 1.0,
+                eye: eye.to_array(),
+                target: centre.with_z(low.z).to_array(),
+            }
+        });
+        Self { keys: keys.collect() }
+    }
+
+    /// Seconds from the first key to the last.
+    #[must_use]
+    pub fn seconds(&self) -> f64 {
+        match (self.keys.first(), self.keys.last()) {
+            (Some(first), Some(last)) => last.seconds - first.seconds,
+            _ => 0.0,
+        }
+    }
+
+    /// The camera at a part (0 to 1) of the path, on a smooth curve through its keys (Catmull and Rom
+    /// 1974).
+    #[must_use]
+    pub fn camera(&self, part: f64, size: [u32; 2]) -> Camera {
+        let keys = &self.keys;
+        let at = |i: usize| keys[i.min(keys.len() - 1)];
+        let seconds = at(0).seconds + self.seconds() * part.clamp(0.0, 1.0);
+        let i = keys.partition_point(|k| k.seconds <= seconds).saturating_sub(1);
+        let (p1, p2) = (at(i), at(i + 1));
+        let (p0, p3) = (at(i.saturating_sub(1)), at(i + 2));
+        let length = p2.seconds - p1.seconds;
+        let t = if length > 0.0 { (seconds - p1.seconds) / length } else { 0.0 };
+        let curve = |f: fn(&PathKey) -> [f64; 3]| {
+            let [a, b, c, d] = [p0, p1, p2, p3].map(|k| DVec3::from_array(f(&k)));
+            let (t2, t3) = (t * t, t * t * t);
+            0.5 * (2.0 * b
+                + (c - a) * t
+                + (2.0 * a - 5.0 * b + 4.0 * c - d) * t2
+                + (3.0 * b - a - 3.0 * c + d) * t3)
+        };
+        Camera { eye: curve(|k| k.eye), target: curve(|k| k.target), fov_y: FOV_Y, size }
+    }
+}
+
+/// How to fly.
+#[derive(Debug, Clone)]
+pub struct Flight {
+    /// Frames to draw.
+    pub frames: u32,
+    /// Frames a second at most; 0: as fast as they can be drawn.
+    pub frames_a_second: f64,
+    /// Width and height, in pixels.
+    pub size: [u32; 2],
+    /// A folder for a PNG of each frame.
+    pub pictures: Option<PathBuf>,
+}
+
+/// One frame of a flight: a line of the CSV.
+#[derive(Debug, Clone, Serialize)]
+pub struct FrameLine {
+    /// From 0.
+    pub frame: u32,
+    /// Seconds since the start.
+    pub seconds: f64,
+    /// Milliseconds to choose the cut and take what has arrived.
+    pub cut_ms: f64,
+    /// Milliseconds to upload and draw, until the picture is there.
+    pub draw_ms: f64,
+    /// The largest error of what is drawn, in pixels.
+    pub error_pixels: f64,
+    /// The error of the ideal cut.
+    pub goal_pixels: f64,
+    /// Whether all that the ideal cut wants is there.
+    pub complete: bool,
+    /// Diamonds drawn.
+    pub diamonds: usize,
+    /// Triangles drawn.
+    pub triangles: u64,
+    /// Draw calls.
+    pub draws: u32,
+    /// Bytes uploaded to the GPU for this frame.
+    pub uploaded_bytes: u64,
+    /// Bytes of surfaces on the GPU.
+    pub gpu_bytes: u64,
+    /// Diamonds resident.
+    pub resident: usize,
+    /// Bytes of memory that they take.
+    pub resident_bytes: usize,
+    /// Bytes received so far.
+    pub bytes: u64,
+    /// Requests sent so far.
+    pub requests: u64,
+    /// Round trips so far.
+    pub round_trips: u64,
+    /// Real points received so far.
+    pub real_points: u64,
+    /// Fictitious points deduced so far.
+    pub fictitious_points: u64,
+}
+
+impl FrameLine {
+    /// The heading of the CSV.
+    pub const HEADING: &str = "frame,seconds,cut_ms,draw_ms,error_pixels,goal_pixels,complete,diamonds,triangles,draws,uploaded_bytes,gpu_bytes,resident,resident_bytes,bytes,requests,round_trips,real_points,fictitious_points";
+
+    /// The line, with the fields of the heading.
+    #[must_use]
+    pub fn csv(&self) -> String {
+        format!(
+            "{},{:.4},{:.3},{:.3},{:.4},{:.4},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+            self.frame,
+            self.seconds,
+            self.cut_ms,
+            self.draw_ms,
+            self.error_pixels,
+            self.goal_pixels,
+            self.complete,
+            self.diamonds,
+            self.triangles,
+            self.draws,
+            self.uploaded_bytes,
+            self.gpu_bytes,
+            self.resident,
+            self.resident_bytes,
+            self.bytes,
+            self.requests,
+            self.round_trips,
+            self.real_points,
+            self.fictitious_points,
+        )
+    }
+}
+
+/// Flies along a path while data stream in. No frame waits for them: each draws what is there. `each` sees
+/// every frame's line and picture as soon as it is drawn.
+///
+/// # Errors
+/// When there is no graphics adapter, a picture cannot be written, or `each` says so.
+pub fn fly(
+    terrain: &mut Terrain,
+    path: &FlightPath,
+    flight: &Flight,
+    look: &Look,
+    options: &render::Options,
+    mut each: impl FnMut(&FrameLine, &Picture) -> Result<(), HeadlessError>,
+) -> Result<(), HeadlessError> {
+    let mut offscreen = Offscreen::new(options)?;
+    let layers = terrain.scene().layers.clone();
+    let started = Instant::now();
+    for frame in 0..flight.frames {
+        if flight.frames_a_second > 0.0 {
+            let due = Duration::from_secs_f64(f64::from(frame) / flight.frames_a_second);
+            std::thread::sleep(due.saturating_sub(started.elapsed()));
+        }
+        let camera = path.camera(f64::from(frame) / f64::from((flight.frames - 1).max(1)), flight.size);
+        let clock = Instant::now();
+        let view = terrain.frame(&camera);
+        let cut_ms = clock.elapsed().as_secs_f64() * 1e3;
+        let clock = Instant::now();
+        let stats = offscreen.draw(&layers, &camera, &view.items, look)?;
+        let picture = offscreen.read()?;
+        let draw_ms = clock.elapsed().as_secs_f64() * 1e3;
+        let line = FrameLine {
+            frame,
+            seconds: started.elapsed().as_secs_f64(),
+            cut_ms,
+            draw_ms,
+            error_pixels: view.error_pixels,
+            goal_pixels: view.error_pixels_goal,
+            complete: view.complete,
+            diamonds: view.items.len(),
+            triangles: stats.triangles,
+            draws: stats.draws,
+            uploaded_bytes: stats.uploaded_bytes,
+            gpu_bytes: stats.gpu_bytes,
+            resident: view.stats.resident,
+            resident_bytes: view.stats.resident_bytes,
+            bytes: view.stats.traffic.bytes,
+            requests: view.stats.traffic.requests,
+            round_trips: view.stats.traffic.round_trips,
+            real_points: view.stats.points_real,
+            fictitious_points: view.stats.points_fictitious,
+        };
+        if let Some(folder) = &flight.pictures {
+            save(&picture, &folder.join(format!("frame-{frame:05}.png")))?;
+        }
+        each(&line, &picture)?;
+    }
+    Ok(())
+}
+
+/// Writes lines of text to a file, or to standard output if it is named `-`.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn open_text(path: &Path) -> Result<Box<dyn Write>, HeadlessError> {
+    if path.as_os_str() == "-" {
+        return Ok(Box::new(std::io::stdout()));
+    }
+    let file = File::create(path).map_err(file_error("write", path))?;
+    Ok(Box::new(BufWriter::new(file)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn key(seconds: f64, x: f64) -> PathKey {
+        PathKey { seconds, eye: [x, 0.0, 100.0], target: [x, 500.0, 0.0] }
+    }
+
+    #[test]
+    fn a_path_passes_through_its_keys() {
+        let path = FlightPath { keys: vec![key(0.0, 0.0), key(1.0, 10.0), key(4.0, 5.0)] };
+        for (part, x) in [(0.0, 0.0), (0.25, 10.0), (1.0, 5.0), (2.0, 5.0)] {
+            assert!((path.camera(part, [4, 3]).eye.x - x).abs() < 1e-9, "{part}");
+        }
+        let lone = FlightPath { keys: vec![key(3.0, 7.0)] };
+        assert_eq!(lone.camera(0.5, [4, 3]).eye.x, 7.0);
+    }
+
+    #[test]
+    fn a_path_that_makes_no_sense_is_refused_with_its_name() {
+        let folder = std::env::temp_dir().join(format!("diamantina-paths-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        for (text, word) in [
+            ("", "EOF"),
+            ("{\"keys\": []}", "0 keys"),
+            (
+                "{\"keys\": [{\"seconds\":1,\"eye\":[0,0,1],\"target\":[0,0,0]},{\"seconds\":1,\"eye\":[0,0,1],\"target\":[0,0,0]}]}",
+                "rise",
+            ),
+            ("{\"keys\": [{\"seconds\":1,\"eye\":[0,0,0],\"target\":[0,0,0]}]}", "its own target"),
+        ] {
+            let path = folder.join("path.json");
+            std::fs::write(&path, text).unwrap();
+            let message = FlightPath::read(&path).unwrap_err().to_string();
+            assert!(message.contains("path.json") && message.contains(word), "{message}");
+        }
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
+    fn the_csv_has_as_many_fields_as_its_heading() {
+        let line = FrameLine {
+            frame: 1,
+            seconds: 2.0,
+            cut_ms: 3.0,
+            draw_ms: 4.0,
+            error_pixels: f64::INFINITY,
+            goal_pixels: 0.5,
+            complete: false,
+            diamonds: 1,
+            triangles: 2,
+            draws: 3,
+            uploaded_bytes: 4,
+            gpu_bytes: 5,
+            resident: 6,
+            resident_bytes: 7,
+            bytes: 8,
+            requests: 9,
+            round_trips: 10,
+            real_points: 11,
+            fictitious_points: 12,
+        };
+        assert_eq!(line.csv().split(',').count(), FrameLine::HEADING.split(',').count());
+        let json = serde_json::to_value(&line).unwrap();
+        for name in FrameLine::HEADING.split(',') {
+            assert!(json.get(name).is_some(), "{name}");
+        }
+    }
+}

@@ -1,0 +1,755 @@
+//! One frame of streaming: what has arrived is taken in, the cut is made, what it lacks is asked for.
+//!
+//! ```text
+//!  fetch's threads ──payloads, pages──► frame ──► cut ──► draw list
+//!        ▲                                │ ▲       │
+//!        └─────────── wishes ─────────────│─│───────┘
+//!                                         ▼ │ surfaces
+//!                                 decoding threads
+//! ```
+//!
+//! A frame never waits: not for the network, not for a decoder. A payload can be decoded once its parents'
+//! surfaces are there; the decoding threads hold it till then and go on from parent to child by
+//! themselves, so a whole branch that arrived in one answer is decoded between two frames.
+
+use crate::cache::{Cache, Index, Key, PAGES_MAX};
+use crate::camera::Camera;
+use crate::cut::{self, Ask, Ideal, Wish};
+use crate::drawing::DrawItem;
+use crate::fetch::{self, Event, FetchError, Fetcher, ROOT_BYTES, Traffic, Want};
+use crate::surface::Surface;
+use bytes::Bytes;
+use diamantina_protocol::diamond::Diamond;
+use diamantina_protocol::message::{Layer, Scene};
+use diamantina_protocol::points::DecodeError;
+use foldhash::fast::RandomState;
+use std::collections::{HashMap, HashSet, VecDeque};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+/// Bytes of payloads that are wished for or wait for their parents. Some 20 000 typical payloads.
+const HELD_BYTES_MAX: usize = 16 << 20;
+
+/// Wishes that are made however much is held: payloads may be waiting for these.
+const WISHES_MIN: usize = 64;
+
+/// Decoded surfaces that wait for a frame to take them: 25 MB for n = 64. The decoders pause there.
+const DONE_MAX: usize = 256;
+
+/// The encoding that this build decodes.
+pub const ENCODING: &str = "points";
+
+/// How to stream a scene.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Options {
+    /// The error to reach, in pixels.
+    pub tolerance_pixels: f64,
+    /// Memory for surfaces, in bytes. What the cut wants takes at most three quarters of it: where that is
+    /// too little for the tolerance, the largest errors are reduced first.
+    pub memory_bytes: usize,
+    /// How diamonds are encoded; only [`ENCODING`] so far.
+    pub encoding: String,
+    /// How to fetch.
+    pub fetch: fetch::Options,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            tolerance_pixels: 1.0,
+            memory_bytes: 512 << 20,
+            encoding: ENCODING.to_owned(),
+            fetch: fetch::Options::default(),
+        }
+    }
+}
+
+/// Why a scene cannot be streamed.
+#[derive(Debug, thiserror::Error)]
+pub enum TerrainError {
+    /// It cannot be fetched.
+    #[error(transparent)]
+    Fetch(#[from] FetchError),
+    /// Not in an encoding that this build decodes.
+    #[error(
+        "layer '{layer}' is offered as {offered:?}, asked for as '{asked}', and this build decodes \
+         '{ENCODING}': build the store with --encoding {ENCODING}"
+    )]
+    Encoding {
+        /// The layer.
+        layer: String,
+        /// Encodings that the server offers.
+        offered: Vec<String>,
+        /// The encoding asked for.
+        asked: String,
+    },
+    /// Not a number of pixels.
+    #[error("tolerance of {0} pixels: expected a number above 0")]
+    Tolerance(f64),
+    /// No threads.
+    #[error("cannot start a decoding thread: {0}")]
+    Thread(#[from] std::io::Error),
+}
+
+/// What has happened since the scene was opened.
+#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
+pub struct Stats {
+    /// What has gone over the wire.
+    pub traffic: Traffic,
+    /// Points decoded whose height was sent.
+    pub points_real: u64,
+    /// Points decoded whose height was deduced.
+    pub points_fictitious: u64,
+    /// Older points made more precise.
+    pub points_corrected: u64,
+    /// Surfaces resident.
+    pub resident: usize,
+    /// Bytes of memory that they take.
+    pub resident_bytes: usize,
+    /// Pages of the index resident.
+    pub pages: usize,
+    /// Payloads that are being decoded or wait for their parents.
+    pub decoding: usize,
+    /// Diamonds that the ideal cut splits.
+    pub splits_ideal: usize,
+    /// Diamonds that the drawn cut splits.
+    pub splits_drawn: usize,
+    /// Things that have failed too often and rest before they are tried again.
+    pub failed: usize,
+    /// Seconds from opening to the first frame that drew something.
+    pub first_picture_seconds: Option<f64>,
+    /// Seconds from opening to the first frame whose error was within the tolerance.
+    pub asked_error_seconds: Option<f64>,
+    /// Seconds that the last frame took.
+    pub frame_seconds: f64,
+}
+
+/// What a frame shows.
+#[derive(Debug, Clone, Default)]
+pub struct FrameView {
+    /// The triangles to draw; together they cover whatever of the scene is in view, once all roots are
+    /// there.
+    pub items: Vec<DrawItem>,
+    /// The largest declared error of what is drawn, in pixels; infinite while a layer lacks a root.
+    pub error_pixels: f64,
+    /// The same, once all that the ideal cut wants has arrived, as far as the index tells already.
+    pub error_pixels_goal: f64,
+    /// Whether all that the ideal cut wants is there.
+    pub complete: bool,
+    /// What has happened so far.
+    pub stats: Stats,
+}
+
+/// A scene that is being streamed.
+///
+/// Takes [`Options::memory_bytes`] (or, if more, the root diamonds) for surfaces, and some 50 MB at most
+/// for what is on its way, besides the index.
+#[derive(Debug)]
+pub struct Terrain {
+    scene: Arc<Scene>,
+    options: Options,
+    layers: Vec<LayerState>,
+    cache: Cache,
+    fetcher: Fetcher,
+    decoders: Decoders,
+    /// Payloads handed to the decoders, with their bytes, and the sum.
+    pending: HashMap<Key, usize, RandomState>,
+    pending_bytes: usize,
+    failed: HashSet<fetch::Key, RandomState>,
+    problem: Option<String>,
+    scene_changed: bool,
+    opened: Instant,
+    stats: Stats,
+}
+
+#[derive(Debug)]
+struct LayerState {
+    index: Index,
+    ideal: Ideal,
+    splits_max: usize,
+}
+
+impl Terrain {
+    /// Opens a scene: reads its description, waiting for it, and starts the threads. `url` as for
+    /// [`Fetcher::open`].
+    ///
+    /// # Errors
+    /// When there is no such scene, or this build cannot show it.
+    pub fn open(url: &str, options: Options) -> Result<Self, TerrainError> {
+        if options.tolerance_pixels.is_nan() || options.tolerance_pixels <= 0.0 {
+            return Err(TerrainError::Tolerance(options.tolerance_pixels));
+        }
+        let opened = Instant::now();
+        let (fetcher, scene) = Fetcher::open(url, options.fetch)?;
+        let unfit =
+            |layer: &&Layer| options.encoding != ENCODING || !layer.encodings.iter().any(|e| e == ENCODING);
+        if let Some(layer) = scene.layers.iter().find(unfit) {
+            return Err(TerrainError::Encoding {
+                layer: layer.name.clone(),
+                offered: layer.encodings.clone(),
+                asked: options.encoding,
+            });
+        }
+        let share = options.memory_bytes / scene.layers.len() / 4 * 3;
+        let state = |layer: &Layer| LayerState {
+            index: Index::new(layer.forest),
+            ideal: Ideal::default(),
+            splits_max: share / Surface::bytes(layer.forest.segments()),
+        };
+        let layers = scene.layers.iter().map(state).collect();
+        let forests = scene.layers.iter().map(|layer| layer.forest).collect();
+        let cache = Cache::new(forests, options.memory_bytes);
+        let scene = Arc::new(scene);
+        Ok(Self {
+            layers,
+            cache,
+            fetcher,
+            decoders: Decoders::start(&scene)?,
+            scene,
+            options,
+            pending: HashMap::default(),
+            pending_bytes: 0,
+            failed: HashSet::default(),
+            problem: None,
+            scene_changed: false,
+            opened,
+            stats: Stats::default(),
+        })
+    }
+
+    /// The scene's description.
+    #[must_use]
+    pub fn scene(&self) -> &Scene {
+        &self.scene
+    }
+
+    /// Whether the server has another version of the scene: what is here stays, and nothing more comes.
+    /// Open it again.
+    #[must_use]
+    pub fn scene_changed(&self) -> bool {
+        self.scene_changed
+    }
+
+    /// The last thing that failed for good, in words.
+    #[must_use]
+    pub fn problem(&self) -> Option<&str> {
+        self.problem.as_deref()
+    }
+
+    /// The error to reach, in pixels.
+    #[must_use]
+    pub fn tolerance_pixels(&self) -> f64 {
+        self.options.tolerance_pixels
+    }
+
+    /// Sets the error to reach, in pixels; what is no number above 0 changes nothing.
+    pub fn set_tolerance_pixels(&mut self, pixels: f64) {
+        if pixels > 0.0 {
+            self.options.tolerance_pixels = pixels;
+        }
+    }
+
+    /// Takes in what has arrived, says what to draw, and asks for what is missing. Never waits; takes
+    /// about a microsecond for each diamond that the cut looks at.
+    pub fn frame(&mut self, camera: &Camera) -> FrameView {
+        let started = Instant::now();
+        self.take_decoded();
+        self.take_fetched();
+        let mut view = FrameView { complete: true, ..FrameView::default() };
+        let mut wishes = Vec::new();
+        (self.stats.splits_ideal, self.stats.splits_drawn) = (0, 0);
+        for (number, state) in self.layers.iter_mut().enumerate() {
+            let ask = Ask {
+                layer: &self.scene.layers[number],
+                camera,
+                tolerance_pixels: self.options.tolerance_pixels,
+                splits_max: state.splits_max,
+            };
+            state.ideal = cut::choose(&ask, |d| state.index.get(d));
+            let drawing = cut::draw(number, &ask, &state.ideal, |d| self.cache.get((number, d)).cloned());
+            self.stats.splits_ideal += state.ideal.len();
+            self.stats.splits_drawn += drawing.splits;
+            view.items.extend(drawing.items);
+            view.error_pixels = view.error_pixels.max(drawing.error_pixels);
+            view.error_pixels_goal = view.error_pixels_goal.max(drawing.error_pixels_goal);
+            view.complete &= drawing.wishes.is_empty() && state.ideal.pages().is_empty();
+            wishes.extend(drawing.wishes.into_iter().map(|wish| (number, wish)));
+            state.index.trim(PAGES_MAX, state.ideal.seen());
+        }
+        let layers = self.layers.iter().enumerate();
+        self.cache.want(layers.flat_map(|(number, state)| state.ideal.splits().map(move |d| (number, d))));
+        self.wish(wishes);
+        self.note(&view, started);
+        view.stats = self.stats;
+        view
+    }
+
+    /// Repeats frames until all that the ideal cut wants is there, or nothing more can come, or the time
+    /// is up. For pictures without a window.
+    pub fn settle(&mut self, camera: &Camera, timeout: Duration) -> FrameView {
+        let until = Instant::now() + timeout;
+        loop {
+            let view = self.frame(camera);
+            let stuck = self.decoders.is_idle() && self.fetcher.is_stuck();
+            if view.complete || stuck || self.scene_changed || Instant::now() >= until {
+                return view;
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+
+    fn take_decoded(&mut self) {
+        for ((number, d), result) in self.decoders.take() {
+            let key = (number, d);
+            self.pending_bytes -= self.pending.remove(&key).unwrap_or(0);
+            match result {
+                Ok(surface) => {
+                    let tally = surface.tally();
+                    self.stats.points_real += u64::from(tally.real);
+                    self.stats.points_fictitious += u64::from(tally.fictitious);
+                    self.stats.points_corrected += u64::from(tally.corrected);
+                    // What finds no room is wished for again when it is needed.
+                    self.cache.insert(key, surface, self.layers[number].ideal.contains(d));
+                }
+                Err(error) => {
+                    tracing::debug!(%error, centre = ?d.centre(), "payload refused");
+                    self.fetcher.refuse(fetch::Key::Diamond(number, d), &FetchError::Damaged(d.centre()));
+                }
+            }
+        }
+    }
+
+    fn take_fetched(&mut self) {
+        while let Some(event) = self.fetcher.poll() {
+            match event {
+                Event::Page(layer, page, entries) => {
+                    self.failed.remove(&fetch::Key::Page(layer, page));
+                    self.layers[layer].index.insert(page, entries);
+                }
+                Event::Payload(layer, d, payload) => {
+                    self.failed.remove(&fetch::Key::Diamond(layer, d));
+                    self.decode((layer, d), payload);
+                }
+                Event::Failed(key, error) => {
+                    tracing::warn!(%error, "given up for now");
+                    self.failed.insert(key);
+                    self.problem = Some(error.to_string());
+                }
+                Event::SceneChanged => self.scene_changed = true,
+            }
+        }
+    }
+
+    fn decode(&mut self, key: Key, payload: Bytes) {
+        if self.pending.contains_key(&key) || self.cache.get(key).is_some() {
+            return;
+        }
+        self.pending.insert(key, payload.len());
+        self.pending_bytes += payload.len();
+        let parents = self.scene.layers[key.0].forest.parents(key.1);
+        let parents = parents.map(|parent| (parent, self.cache.get((key.0, parent)).cloned())).collect();
+        self.decoders.submit(key, Job { payload, parents });
+    }
+
+    /// Asks for what the cut lacks: roots of all layers, pages, then payloads as they are urgent.
+    fn wish(&mut self, mut wishes: Vec<(usize, Wish)>) {
+        for key in self.decoders.forget(|(number, d)| self.layers[number].ideal.contains(d)) {
+            self.pending_bytes -= self.pending.remove(&key).unwrap_or(0);
+        }
+        if self.layers.len() > 1 {
+            wishes.sort_by(|(_, a), (_, b)| a.order(b));
+        }
+        let mut wants = Vec::with_capacity(wishes.len());
+        let mut room = HELD_BYTES_MAX.saturating_sub(self.pending_bytes);
+        let mut payloads = wishes.into_iter().peekable();
+        while let Some((number, wish)) = payloads.next_if(|(_, wish)| wish.diamond.level() == 0) {
+            self.want((number, wish), &mut wants, &mut room);
+        }
+        for (number, state) in self.layers.iter().enumerate() {
+            wants.extend(
+                state.ideal.pages().iter().map(|p| Want { key: fetch::Key::Page(number, *p), bytes: None }),
+            );
+        }
+        let pages_and_roots = wants.len();
+        for wish in payloads {
+            if room == 0 && wants.len() >= pages_and_roots + WISHES_MIN {
+                break;
+            }
+            self.want(wish, &mut wants, &mut room);
+        }
+        self.fetcher.wish(wants);
+    }
+
+    fn want(&mut self, (number, wish): (usize, Wish), wants: &mut Vec<Want>, room: &mut usize) {
+        let key = (number, wish.diamond);
+        if self.pending.contains_key(&key) {
+            return;
+        }
+        if wish.bytes == Some(0) {
+            // Nothing to fetch: it follows from its parents.
+            self.decode(key, Bytes::new());
+            return;
+        }
+        *room = room.saturating_sub(wish.bytes.unwrap_or(ROOT_BYTES) as usize);
+        wants.push(Want { key: fetch::Key::Diamond(number, wish.diamond), bytes: wish.bytes });
+    }
+
+    fn note(&mut self, view: &FrameView, started: Instant) {
+        let since = self.opened.elapsed().as_secs_f64();
+        if !view.items.is_empty() {
+            self.stats.first_picture_seconds.get_or_insert(since);
+            if view.error_pixels <= self.options.tolerance_pixels {
+                self.stats.asked_error_seconds.get_or_insert(since);
+            }
+        }
+        self.stats.traffic = self.fetcher.traffic();
+        self.stats.resident = self.cache.len();
+        self.stats.resident_bytes = self.cache.bytes();
+        self.stats.pages = self.layers.iter().map(|state| state.index.pages()).sum();
+        self.stats.decoding = self.pending.len();
+        self.stats.failed = self.failed.len();
+        self.stats.frame_seconds = started.elapsed().as_secs_f64();
+    }
+}
+
+/// A payload with its parents' surfaces, as far as they are there.
+#[derive(Debug)]
+struct Job {
+    payload: Bytes,
+    parents: Vec<(Diamond, Option<Arc<Surface>>)>,
+}
+
+impl Job {
+    fn is_ready(&self) -> bool {
+        self.parents.iter().all(|(_, surface)| surface.is_some())
+    }
+}
+
+type Decoded = (Key, Result<Arc<Surface>, DecodeError>);
+
+/// Threads that decode payloads whose parents are there, and hold the others.
+#[derive(Debug)]
+struct Decoders {
+    shared: Arc<Bench>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+#[derive(Debug)]
+struct Bench {
+    scene: Arc<Scene>,
+    state: Mutex<Jobs>,
+    changed: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct Jobs {
+    /// Without all their parents. Bounded with `ready` by [`HELD_BYTES_MAX`] and the ideal cut.
+    held: HashMap<Key, Job, RandomState>,
+    ready: VecDeque<(Key, Job)>,
+    /// What no frame has taken yet, in the order of decoding, so parents before children.
+    done: Vec<Decoded>,
+    fresh: HashMap<Key, Arc<Surface>, RandomState>,
+    running: usize,
+    closed: bool,
+}
+
+impl Decoders {
+    fn start(scene: &Arc<Scene>) -> std::io::Result<Self> {
+        let shared =
+            Arc::new(Bench { scene: Arc::clone(scene), state: Mutex::default(), changed: Condvar::new() });
+        let count = std::thread::available_parallelism()?.get();
+        let mut decoders = Self { shared, threads: Vec::with_capacity(count) };
+        for _ in 0..count {
+            let bench = Arc::clone(&decoders.shared);
+            let thread = std::thread::Builder::new().name("diamantina-decode".into());
+            decoders.threads.push(thread.spawn(move || bench.work())?);
+        }
+        Ok(decoders)
+    }
+
+    fn submit(&self, key: Key, mut job: Job) {
+        let mut jobs = self.shared.lock();
+        for (parent, surface) in job.parents.iter_mut().filter(|(_, surface)| surface.is_none()) {
+            *surface = jobs.fresh.get(&(key.0, *parent)).cloned();
+        }
+        if job.is_ready() {
+            jobs.ready.push_back((key, job));
+            self.shared.changed.notify_one();
+        } else {
+            jobs.held.insert(key, job);
+        }
+    }
+
+    /// What has been decoded since the last call, parents before children.
+    fn take(&self) -> Vec<Decoded> {
+        let mut jobs = self.shared.lock();
+        jobs.fresh.clear();
+        if jobs.done.len() >= DONE_MAX {
+            self.shared.changed.notify_all();
+        }
+        std::mem::take(&mut jobs.done)
+    }
+
+    /// Whether nothing is being decoded, about to be, or left to take.
+    fn is_idle(&self) -> bool {
+        let jobs = self.shared.lock();
+        jobs.ready.is_empty() && jobs.running == 0 && jobs.done.is_empty()
+    }
+
+    /// Drops what has not been begun and need not be kept; tells what it was.
+    fn forget(&self, keep: impl Fn(Key) -> bool) -> Vec<Key> {
+        let mut jobs = self.shared.lock();
+        let mut forgotten = Vec::new();
+        let mut keep = |key: Key| {
+            let keep = keep(key);
+            if !keep {
+                forgotten.push(key);
+            }
+            keep
+        };
+        jobs.held.retain(|key, _| keep(*key));
+        jobs.ready.retain(|(key, _)| keep(*key));
+        forgotten
+    }
+}
+
+impl Drop for Decoders {
+    fn drop(&mut self) {
+        self.shared.lock().closed = true;
+        self.shared.changed.notify_all();
+        for thread in self.threads.drain(..) {
+            // A thread that panicked has said so already.
+            let _ = thread.join();
+        }
+    }
+}
+
+impl Bench {
+    fn lock(&self) -> MutexGuard<'_, Jobs> {
+        // The jobs are whole between any two statements, whoever panicked.
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn work(&self) {
+        let mut jobs = self.lock();
+        while !jobs.closed {
+            let job = if jobs.done.len() < DONE_MAX { jobs.ready.pop_front() } else { None };
+            let Some((key, job)) = job else {
+                jobs = self.changed.wait(jobs).unwrap_or_else(PoisonError::into_inner);
+                continue;
+            };
+            jobs.running += 1;
+            drop(jobs);
+            let (layer, d) = key;
+            let parents: Vec<(Diamond, &Surface)> =
+                job.parents.iter().filter_map(|(parent, s)| Some((*parent, s.as_deref()?))).collect();
+            let layer_of = &self.scene.layers[layer];
+            let result = Surface::split(layer_of, d, &parents, &job.payload).map(Arc::new);
+            drop(job);
+            jobs = self.lock();
+            jobs.running -= 1;
+            if let Ok(surface) = &result {
+                jobs.fresh.insert(key, Arc::clone(surface));
+                for child in layer_of.forest.children(d).into_iter().flatten() {
+                    self.release(&mut jobs, (layer, child), d, surface);
+                }
+            }
+            jobs.done.push((key, result));
+        }
+    }
+
+    /// Gives a parent to a held child, which may be all that it waits for.
+    fn release(&self, jobs: &mut Jobs, child: Key, parent: Diamond, surface: &Arc<Surface>) {
+        let Some(job) = jobs.held.get_mut(&child) else { return };
+        for (_, slot) in job.parents.iter_mut().filter(|(p, _)| *p == parent) {
+            *slot = Some(Arc::clone(surface));
+        }
+        if job.is_ready()
+            && let Some(job) = jobs.held.remove(&child)
+        {
+            jobs.ready.push_back((child, job));
+            self.changed.notify_one();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::world::{Dice, Faults, Served, above, any_camera};
+    use glam::DVec3;
+
+    const MINUTE: Duration = Duration::from_secs(60);
+
+    fn open(served: &Served, options: Options) -> Terrain {
+        Terrain::open(&served.url, options).unwrap()
+    }
+
+    #[test]
+    fn settling_reaches_the_asked_error_in_few_round_trips() {
+        for layers in [1, 2] {
+            let served = Served::start(layers, Faults::default());
+            let mut terrain = open(&served, Options::default());
+            let camera = above();
+            let view = terrain.settle(&camera, MINUTE);
+            assert!(view.complete && view.error_pixels <= 1.0, "{view:?}");
+            assert_eq!(view.error_pixels, view.error_pixels_goal);
+            let stats = view.stats;
+            println!("{layers} layers: {stats:?}");
+            assert!(stats.traffic.round_trips <= 4, "scene, roots with their pages, deeper pages, the rest");
+            assert!(stats.traffic.errors == 0 && stats.failed == 0 && stats.decoding == 0);
+            assert!(stats.points_real > 0 && stats.points_fictitious > 0);
+            assert!(stats.first_picture_seconds <= stats.asked_error_seconds);
+            assert_eq!(view.items.iter().map(|item| item.layer).max(), Some(layers - 1));
+            // Nothing moves, so nothing more is asked for.
+            let again = terrain.frame(&camera);
+            assert_eq!(again.stats.traffic.requests, stats.traffic.requests);
+        }
+    }
+
+    #[test]
+    fn from_the_first_picture_on_something_is_always_drawn_and_it_gets_better() {
+        let served = Served::start(2, Faults { slow: 0.5, ..Faults::default() });
+        let mut terrain = open(&served, Options::default());
+        let camera = above();
+        let until = Instant::now() + MINUTE;
+        let mut last = f64::INFINITY;
+        let mut pictures = 0;
+        while Instant::now() < until {
+            let view = terrain.frame(&camera);
+            assert!(view.error_pixels <= last, "a still camera's picture never gets worse");
+            assert!(view.error_pixels.is_finite() || pictures == 0);
+            pictures += usize::from(view.error_pixels < last);
+            last = view.error_pixels;
+            if view.complete {
+                break;
+            }
+            std::thread::sleep(Duration::from_millis(3));
+        }
+        println!("{pictures} pictures, each with less error");
+        assert!(last <= 1.0 && pictures > 2);
+    }
+
+    #[test]
+    fn a_flight_in_little_memory_stays_within_it_and_never_shows_nothing() {
+        let served = Served::start(1, Faults::default());
+        let memory_bytes = 400 * Surface::bytes(16);
+        let mut terrain = open(&served, Options { memory_bytes, ..Options::default() });
+        terrain.settle(&above(), MINUTE);
+        let mut dice = Dice(5);
+        for _ in 0..25 {
+            let (from, to) = (any_camera(&mut dice), any_camera(&mut dice));
+            for step in 0..20 {
+                let eye = from.eye.lerp(to.eye, f64::from(step) / 20.0);
+                let target = DVec3::new(505_000.0, 4_002_000.0, 100.0);
+                let view = terrain.frame(&Camera { eye, target, ..from });
+                assert!(!view.items.is_empty());
+                assert!(view.stats.resident_bytes <= memory_bytes);
+                assert!(view.stats.frame_seconds < 0.05, "{}", view.stats.frame_seconds);
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        }
+        let view = terrain.settle(&above(), MINUTE);
+        assert!(view.complete && view.stats.splits_drawn <= 300);
+        assert_eq!(view.error_pixels, view.error_pixels_goal, "the best that the memory allows");
+    }
+
+    /// Streams from a server that misbehaves; the view at the end, and the longest frame.
+    fn endure(faults: Faults, seconds: u64) -> (FrameView, f64, Option<String>) {
+        let served = Served::start(2, faults);
+        let patience = Duration::from_millis(500);
+        let fetch = fetch::Options { patience, ..fetch::Options::default() };
+        let mut terrain = open(&served, Options { fetch, ..Options::default() });
+        let until = Instant::now() + Duration::from_secs(seconds);
+        let mut longest = 0.0f64;
+        loop {
+            let started = Instant::now();
+            let view = terrain.frame(&above());
+            longest = longest.max(started.elapsed().as_secs_f64());
+            if view.complete || Instant::now() > until {
+                println!("{faults:?}: {:.1} ms at most, {:?}", longest * 1e3, view.stats.traffic);
+                return (view, longest, terrain.problem().map(str::to_owned));
+            }
+            std::thread::sleep(Duration::from_millis(3));
+        }
+    }
+
+    #[test]
+    fn a_server_that_misbehaves_now_and_then_is_endured_without_a_slow_frame() {
+        let some = 0.25;
+        let faults = [
+            Faults { status_500: some, ..Faults::default() },
+            Faults { truncated: some, ..Faults::default() },
+            Faults { damaged: some / 5.0, ..Faults::default() },
+            Faults { silent: some, ..Faults::default() },
+            Faults { absurd: some / 20.0, ..Faults::default() },
+            Faults { garbage: some, ..Faults::default() },
+            Faults { bomb: some, ..Faults::default() },
+        ];
+        std::thread::scope(|scope| {
+            for faults in faults {
+                scope.spawn(move || {
+                    // Room for wishes that were unlucky five times and rest.
+                    let (view, longest, problem) = endure(faults, 60);
+                    assert!(view.complete && view.error_pixels <= 1.0, "{faults:?} {problem:?}");
+                    assert!(longest < 0.05, "{longest} s {faults:?}");
+                });
+            }
+        });
+    }
+
+    #[test]
+    fn a_server_that_always_misbehaves_is_reported_without_a_slow_frame() {
+        let faults = [
+            Faults { status_500: 1.0, ..Faults::default() },
+            Faults { damaged: 1.0, ..Faults::default() },
+            Faults { garbage: 1.0, ..Faults::default() },
+            Faults { bomb: 1.0, ..Faults::default() },
+            Faults { silent: 1.0, ..Faults::default() },
+        ];
+        std::thread::scope(|scope| {
+            for faults in faults {
+                scope.spawn(move || {
+                    let (view, longest, problem) = endure(faults, 9);
+                    assert!(!view.complete && view.stats.failed > 0 && problem.is_some(), "{faults:?}");
+                    assert!(longest < 0.05, "{longest} s {faults:?}");
+                    assert_eq!(view.items.is_empty(), faults.bomb == 0.0, "roots alone make a picture");
+                });
+            }
+        });
+    }
+
+    #[test]
+    fn settling_ends_early_where_nothing_more_can_come() {
+        let served = Served::start(1, Faults { status_500: 0.0, ..Faults::default() });
+        let mut terrain = open(&served, Options::default());
+        served.misbehave(Faults { status_500: 1.0, ..Faults::default() });
+        let started = Instant::now();
+        let view = terrain.settle(&above(), MINUTE);
+        assert!(!view.complete && started.elapsed() < Duration::from_secs(15));
+        assert!(terrain.problem().unwrap().contains("500"));
+    }
+
+    #[test]
+    fn a_new_version_of_the_scene_is_noticed_and_the_picture_stays() {
+        let served = Served::start(1, Faults::default());
+        let mut terrain = open(&served, Options { tolerance_pixels: 20.0, ..Options::default() });
+        let view = terrain.settle(&above(), MINUTE);
+        assert!(view.complete && !terrain.scene_changed());
+        served.misbehave(Faults { gone: true, ..Faults::default() });
+        terrain.set_tolerance_pixels(1.0);
+        let view = terrain.settle(&above(), MINUTE);
+        assert!(terrain.scene_changed() && !view.items.is_empty() && !view.complete);
+    }
+
+    #[test]
+    fn wrong_options_are_refused() {
+        let served = Served::start(1, Faults::default());
+        let tin = Options { encoding: "tin".into(), ..Options::default() };
+        let error = Terrain::open(&served.url, tin).unwrap_err().to_string();
+        assert!(error.contains("'tin'") && error.contains("points"), "{error}");
+        let zero = Options { tolerance_pixels: 0.0, ..Options::default() };
+        assert!(matches!(Terrain::open(&served.url, zero), Err(TerrainError::Tolerance(_))));
+    }
+}

@@ -1,0 +1,369 @@
+//! A small scene made by code, and a server of it that can misbehave: for the tests of this crate.
+
+use crate::camera::{Camera, FOV_Y};
+use crate::surface::Surface;
+use axum::Router;
+use axum::body::{Body, Bytes};
+use axum::extract::{Path, RawQuery, State};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use diamantina_protocol::NODATA;
+use diamantina_protocol::bintree::Forest;
+use diamantina_protocol::diamond::{Block, Diamond};
+use diamantina_protocol::index::{self, Entry};
+use diamantina_protocol::message::{self, Catalogue, Frame, FrameHeader, Kind, Layer, Scene, Status};
+use diamantina_protocol::points::{self, Coding, Rule};
+use glam::DVec3;
+use std::collections::HashMap;
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, OnceLock};
+use std::time::Duration;
+
+/// A layer with all that a store would have of it.
+pub(crate) struct Built {
+    pub(crate) layer: Layer,
+    pub(crate) entries: HashMap<Diamond, Entry>,
+    pub(crate) payloads: HashMap<Diamond, Vec<u8>>,
+    /// Parents before children.
+    pub(crate) diamonds: Vec<Diamond>,
+}
+
+/// Hills with a coast in the east, a round lake without data, and a margin without data in the north.
+fn hills(x: u32, y: u32) -> i32 {
+    let (fx, fy) = (f64::from(x), f64::from(y));
+    let coast = 880.0 + 60.0 * (fy / 37.0).sin();
+    let lake = (fx - 300.0).hypot(fy - 200.0) < 70.0;
+    if fx > coast || lake || y > 490 {
+        return NODATA;
+    }
+    let noise = (x.wrapping_mul(374_761_393) ^ y.wrapping_mul(668_265_263)).wrapping_mul(1_274_126_177) >> 24;
+    let hills = 900.0 * (fx / 90.0).sin() * (fy / 70.0).cos() + 240.0 * (fx / 13.0).cos() * (fy / 17.0).sin();
+    (hills + 3000.0) as i32 + (noise % 40) as i32
+}
+
+fn pond(x: u32, y: u32) -> i32 {
+    if (f64::from(x) - 150.0).hypot(f64::from(y) - 100.0) < 40.0 { 2900 + (x / 8) as i32 } else { NODATA }
+}
+
+/// The scene, made once: terrain of 1024 x 512 cells with two root squares, and a pond.
+pub(crate) fn world() -> &'static [Built] {
+    static WORLD: OnceLock<Vec<Built>> = OnceLock::new();
+    WORLD.get_or_init(|| {
+        vec![
+            build("terrain", Kind::Terrain, Forest::new(9, 4, [2, 1]).unwrap(), [10.0, 10.0], hills),
+            build("water", Kind::Water, Forest::new(9, 3, [1, 1]).unwrap(), [10.0, 10.0], pond),
+        ]
+    })
+}
+
+pub(crate) fn scene(layers: usize) -> Scene {
+    Scene {
+        name: "hills".into(),
+        version: "v1".into(),
+        frame: Frame { crs: None, vertical_unit: "metre".into() },
+        layers: world()[..layers].iter().map(|built| built.layer.clone()).collect(),
+        zones: Vec::new(),
+    }
+}
+
+fn build(name: &str, kind: Kind, forest: Forest, cell: [f64; 2], height: fn(u32, u32) -> i32) -> Built {
+    let levels = forest.levels();
+    let exponents = (0..=levels).map(|l| ((levels - l) / 4).min(3) as u8).collect();
+    let coding = Coding::new(Rule::Smooth, 3, exponents).unwrap();
+    let quantum = 0.1;
+    let diamonds: Vec<Diamond> = (0..levels).flat_map(|l| forest.diamonds(l)).collect();
+    let mut blocks: HashMap<Diamond, Block> = HashMap::new();
+    let (mut payloads, mut entries) = (HashMap::new(), HashMap::new());
+    for d in &diamonds {
+        let (mut block, mut source) = (Block::empty(&forest), Block::empty(&forest));
+        for parent in forest.parents(*d) {
+            block.inherit(&forest, *d, parent, &blocks[&parent]);
+        }
+        source.fill(&forest.local(*d), height);
+        let before = block.clone();
+        payloads.insert(*d, points::encode(&forest, &coding, *d, &mut block, &source));
+        entries.insert(*d, entry(&before, &block, &source, d.level() == 0, quantum, payloads[d].len()));
+        blocks.insert(*d, block);
+    }
+    // Errors of a split and of all below add up to a bound; ranges and bytes of children are within.
+    let finest_error = (1.0 * quantum) as f32;
+    for d in diamonds.iter().rev() {
+        let mut entry = entries[d];
+        let mut below = finest_error;
+        for child in forest.children(*d).into_iter().flatten().map(|c| entries[&c]) {
+            below = below.max(child.error_metres);
+            if !child.is_empty() {
+                let is_empty = entry.is_empty();
+                entry.low = if is_empty { child.low } else { entry.low.min(child.low) };
+                entry.high = if is_empty { child.high } else { entry.high.max(child.high) };
+            }
+        }
+        entry.error_metres = index::declared(entry.error_metres + below);
+        if entry.is_empty() {
+            entry = Entry::EMPTY;
+        }
+        entries.insert(*d, entry);
+    }
+    let layer = Layer {
+        name: name.into(),
+        kind,
+        forest,
+        origin: [500_000.0, 4_000_000.0],
+        cell,
+        samples: forest.size().map(|s| s + 1),
+        valid_samples: 1,
+        quantum,
+        height_offset: 12.5,
+        heights: [0.0, 500.0],
+        max_error: 0.1,
+        finest_error,
+        encodings: vec!["points".into()],
+        coding,
+        bytes: payloads.values().map(|p| p.len() as u64).sum(),
+        resampled: false,
+        errors: "bound".into(),
+    };
+    Built { layer, entries, payloads, diamonds }
+}
+
+/// What one split changes at most, and the range of heights.
+fn entry(before: &Block, after: &Block, source: &Block, root: bool, quantum: f64, bytes: usize) -> Entry {
+    let n = after.segments();
+    let (old, new) = before.parts();
+    let (old, _) = if root { after.parts() } else { (old, new) };
+    let mut most = 0;
+    for v in 0..n {
+        for u in 0..n {
+            let at = v * (n + 1) + u;
+            let corners = [old[at], old[at + 1], old[at + n + 2], old[at + n + 1]];
+            let height = after.parts().1[v * n + u];
+            for corner in corners.into_iter().filter(|h| *h != NODATA && height != NODATA) {
+                most = most.max((corner - height).abs());
+            }
+        }
+    }
+    for (a, b) in old.iter().zip(after.parts().0).filter(|(a, b)| **a != NODATA && **b != NODATA) {
+        most = most.max((a - b).abs());
+    }
+    let heights = || old.iter().chain(after.heights()).chain(source.heights()).filter(|h| **h != NODATA);
+    Entry {
+        error_metres: (f64::from(most) * quantum) as f32,
+        low: heights().min().copied().unwrap_or(0),
+        high: heights().max().copied().unwrap_or(-1),
+        bytes: bytes as u32,
+    }
+}
+
+/// The surface of each diamond that has all its ancestors among `wanted`, decoded.
+pub(crate) fn surfaces(built: &Built, wanted: impl Fn(Diamond) -> bool) -> HashMap<Diamond, Arc<Surface>> {
+    let mut surfaces: HashMap<Diamond, Arc<Surface>> = HashMap::new();
+    for d in built.diamonds.iter().copied().filter(|d| wanted(*d)) {
+        let parents: Option<Vec<_>> =
+            built.layer.forest.parents(d).map(|p| Some((p, &**surfaces.get(&p)?))).collect();
+        if let Some(parents) = parents {
+            let surface = Surface::split(&built.layer, d, &parents, &built.payloads[&d]).unwrap();
+            surfaces.insert(d, Arc::new(surface));
+        }
+    }
+    surfaces
+}
+
+/// Numbers that look random, the same each time.
+pub(crate) struct Dice(pub(crate) u64);
+
+impl Dice {
+    pub(crate) fn roll(&mut self) -> f64 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 33) as f64 / f64::from(1u32 << 31)
+    }
+}
+
+/// A camera somewhere in or around the terrain.
+pub(crate) fn any_camera(dice: &mut Dice) -> Camera {
+    let mut point = |margin: f64, z: f64| {
+        let along = |size: f64, roll: f64| size * (roll * (1.0 + 2.0 * margin) - margin);
+        DVec3::new(
+            500_000.0 + along(10_240.0, dice.roll()),
+            4_000_000.0 + along(5120.0, dice.roll()),
+            z * dice.roll(),
+        )
+    };
+    Camera { eye: point(0.3, 6000.0), target: point(0.0, 300.0), fov_y: FOV_Y, size: [1380, 768] }
+}
+
+/// A camera that sees all of the terrain.
+pub(crate) fn above() -> Camera {
+    let target = DVec3::new(505_120.0, 4_002_560.0, 300.0);
+    Camera { eye: target + DVec3::new(0.0, -6000.0, 9000.0), target, fov_y: FOV_Y, size: [1380, 768] }
+}
+
+/// How a server misbehaves. Each is a chance from 0 to 1 for an answer (or, for `damaged`, a payload).
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Faults {
+    pub(crate) status_500: f64,
+    pub(crate) truncated: f64,
+    pub(crate) damaged: f64,
+    pub(crate) slow: f64,
+    pub(crate) silent: f64,
+    pub(crate) absurd: f64,
+    pub(crate) garbage: f64,
+    pub(crate) bomb: f64,
+    pub(crate) gone: bool,
+}
+
+/// A server of the scene on a free port, on a runtime of its own.
+pub(crate) struct Served {
+    pub(crate) url: String,
+    pub(crate) state: Arc<Serving>,
+    runtime: Option<tokio::runtime::Runtime>,
+}
+
+pub(crate) struct Serving {
+    scene: Scene,
+    pub(crate) faults: Mutex<Faults>,
+    pub(crate) requests: AtomicUsize,
+    dice: AtomicU64,
+}
+
+impl Serving {
+    fn happens(&self, chance: f64) -> bool {
+        Dice(self.dice.fetch_add(0x9E37_79B9_7F4A_7C15, Ordering::Relaxed)).roll() < chance
+    }
+
+    fn faults(&self) -> Faults {
+        *self.faults.lock().unwrap()
+    }
+}
+
+impl Served {
+    pub(crate) fn start(layers: usize, faults: Faults) -> Self {
+        let state = Arc::new(Serving {
+            scene: scene(layers),
+            faults: Mutex::new(faults),
+            requests: AtomicUsize::new(0),
+            dice: AtomicU64::new(1),
+        });
+        let router = Router::new()
+            .route("/scenes", get(catalogue))
+            .route("/scenes/{scene}", get(description))
+            .route("/scenes/{scene}/{version}/{layer}/index/{page}", get(page))
+            .route("/scenes/{scene}/{version}/{layer}/points", get(batch))
+            .with_state(Arc::clone(&state));
+        let runtime =
+            tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
+        let listener = runtime.block_on(tokio::net::TcpListener::bind("127.0.0.1:0")).unwrap();
+        let url = format!("http://{}", listener.local_addr().unwrap());
+        runtime.spawn(async move { axum::serve(listener, router).await });
+        Self { url, state, runtime: Some(runtime) }
+    }
+
+    pub(crate) fn misbehave(&self, faults: Faults) {
+        *self.state.faults.lock().unwrap() = faults;
+    }
+}
+
+impl Drop for Served {
+    fn drop(&mut self) {
+        if let Some(runtime) = self.runtime.take() {
+            runtime.shutdown_background();
+        }
+    }
+}
+
+type Shared = State<Arc<Serving>>;
+
+async fn catalogue(State(state): Shared) -> Response {
+    let catalogue = Catalogue { scenes: vec![state.scene.clone()] };
+    serde_json::to_vec(&catalogue).unwrap().into_response()
+}
+
+async fn description(State(state): Shared, Path(name): Path<String>) -> Response {
+    let mut scene = state.scene.clone();
+    if name != scene.name {
+        return StatusCode::NOT_FOUND.into_response();
+    }
+    if state.faults().gone {
+        scene.version = "v2".into();
+    }
+    serde_json::to_vec(&scene).unwrap().into_response()
+}
+
+/// Faults that any answer may have.
+async fn common(state: &Serving) -> Option<Response> {
+    state.requests.fetch_add(1, Ordering::Relaxed);
+    let faults = state.faults();
+    if faults.gone {
+        return Some(StatusCode::GONE.into_response());
+    }
+    if state.happens(faults.status_500) {
+        return Some(StatusCode::INTERNAL_SERVER_ERROR.into_response());
+    }
+    if state.happens(faults.garbage) {
+        return Some(vec![0xFFu8; 5000].into_response());
+    }
+    if state.happens(faults.silent) {
+        tokio::time::sleep(Duration::from_secs(60)).await;
+    }
+    None
+}
+
+async fn page(
+    State(state): Shared,
+    Path((_, _, layer, page)): Path<(String, String, String, u32)>,
+) -> Response {
+    if let Some(fault) = common(&state).await {
+        return fault;
+    }
+    if state.happens(state.faults().bomb) {
+        return zstd::bulk::compress(&vec![0u8; 64 << 20], 1).unwrap().into_response();
+    }
+    let built = world().iter().find(|built| built.layer.name == layer).unwrap();
+    let diamonds = index::page_diamonds(&built.layer.forest, page).unwrap();
+    let entries: Vec<Entry> = diamonds.iter().map(|d| built.entries[d]).collect();
+    zstd::bulk::compress(&index::encode(&entries), 3).unwrap().into_response()
+}
+
+async fn batch(
+    State(state): Shared,
+    Path((_, _, layer)): Path<(String, String, String)>,
+    RawQuery(query): RawQuery,
+) -> Response {
+    if let Some(fault) = common(&state).await {
+        return fault;
+    }
+    let faults = state.faults();
+    let built = world().iter().find(|built| built.layer.name == layer).unwrap();
+    let centres = message::parse_batch(query.unwrap().strip_prefix("d=").unwrap()).unwrap();
+    let mut body = Vec::new();
+    for centre in centres {
+        let d = built.layer.forest.diamond(centre).unwrap();
+        let mut payload = built.payloads[&d].clone();
+        if payload.is_empty() {
+            FrameHeader::without(centre, Status::Missing).write(&mut body);
+            continue;
+        }
+        let mut header = FrameHeader::of(centre, &payload);
+        if state.happens(faults.damaged) {
+            payload[3] ^= 64;
+        }
+        if state.happens(faults.absurd / 8.0) {
+            header.length = u32::MAX;
+        }
+        header.write(&mut body);
+        body.extend(payload);
+    }
+    if state.happens(faults.truncated) {
+        body.truncate(body.len() / 2);
+    }
+    let slow = state.happens(faults.slow);
+    let chunks: Vec<Vec<u8>> = body.chunks(1000).map(<[u8]>::to_vec).collect();
+    let stream = futures_util::stream::unfold(chunks.into_iter(), move |mut chunks| async move {
+        let chunk = chunks.next()?;
+        if slow {
+            tokio::time::sleep(Duration::from_millis(30)).await;
+        }
+        Some((Ok::<_, std::io::Error>(Bytes::from(chunk)), chunks))
+    });
+    Body::from_stream(stream).into_response()
+}
