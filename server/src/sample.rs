@@ -93,16 +93,14 @@ pub fn height(east: f64, north: f64) -> Option<f32> {
     Some(((height.max(0.3) * 10.0).round() / 10.0) as f32)
 }
 
-/// Writes the landscape as a GeoTIFF of 32-bit floats, `samples` a side, deflated.
+/// Writes the landscape as a GeoTIFF of 32-bit floats, `samples` a side.
 ///
 /// # Errors
 /// When the file cannot be written.
 pub fn write(path: &Path, samples: u32) -> Result<(), String> {
     let failed = |e: &dyn std::fmt::Display| format!("{}: cannot write the sample DEM: {e}", path.display());
     let file = BufWriter::new(File::create(path).map_err(|e| failed(&e))?);
-    let mut encoder = TiffEncoder::new(file)
-        .map_err(|e| failed(&e))?
-        .with_compression(tiff::encoder::Compression::Deflate(tiff::encoder::DeflateLevel::Fast));
+    let mut encoder = TiffEncoder::new(file).map_err(|e| failed(&e))?;
     let mut image = encoder.new_image::<colortype::Gray32Float>(samples, samples).map_err(|e| failed(&e))?;
     let scale: &[f64] = &[CELL, CELL, 0.0];
     let tie: &[f64] = &[0.0, 0.0, 0.0, CORNER[0], CORNER[1], 0.0];
