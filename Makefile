@@ -37,13 +37,13 @@ clippy:
 
 # With the output of tests that pass: it says which of them had no data to work on.
 tests:
-	@$(step) tests cargo test --locked --workspace -- --show-output
+	@$(step) tests cargo test --locked --workspace --no-fail-fast -- --show-output
 
 doc:
 	@RUSTDOCFLAGS="-D warnings" $(step) doc cargo doc --locked --workspace --no-deps
 
 deny:
-	@$(step) deny scripts/deny check bans licenses sources
+	@$(step) deny scripts/deny check --hide-inclusion-graph bans licenses sources
 
 wasm:
 	@$(step) wasm scripts/wasm

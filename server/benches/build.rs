@@ -1,4 +1,5 @@
 //! The two steps of a build that touch every sample again and again: reading windows, measuring errors.
+#![allow(clippy::cast_possible_truncation, reason = "heights below 3000 m")]
 
 use criterion::{Criterion, Throughput};
 use diamantina_protocol::bintree::Forest;
