@@ -12,6 +12,13 @@
 //!
 //! Everything written is a function of the source and the options, whatever the number of threads.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    reason = "lattice coordinates are below 2^28, sizes within the memory that was granted, and heights are checked against the range of quanta before they become integers"
+)]
+
 use crate::canvas::{Canvas, Window};
 use crate::ingest::{Grid, IngestError, Source};
 use crate::measure::{Found, Samples, measure};
