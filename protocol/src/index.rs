@@ -272,7 +272,7 @@ mod tests {
     }
 
     fn entries(count: usize) -> Vec<Entry> {
-        (0..count as i32)
+        (0..i32::try_from(count).unwrap())
             .map(|i| {
                 if i % 7 == 3 {
                     Entry::EMPTY

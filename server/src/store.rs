@@ -345,13 +345,11 @@ impl Drop for Writer {
     }
 }
 
+/// Where each blob went, and the bytes of each pack.
+type Packed = (Vec<(Key, Place)>, Vec<u64>);
+
 /// Copies the blobs, in order, into packs.
-fn lay_packs(
-    spool: &File,
-    spool_path: &Path,
-    blobs: &[Spooled],
-    data: &Path,
-) -> Result<(Vec<(Key, Place)>, Vec<u64>), StoreError> {
+fn lay_packs(spool: &File, spool_path: &Path, blobs: &[Spooled], data: &Path) -> Result<Packed, StoreError> {
     let mut entries = Vec::with_capacity(blobs.len());
     let mut pack_bytes = Vec::new();
     let mut buffer = Vec::new();
