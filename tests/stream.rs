@@ -10,6 +10,7 @@ use glam::DVec3;
 use std::fmt::Write as _;
 use std::io::Write as _;
 use std::process::Command;
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 const MAGENTA: [u8; 4] = [255, 0, 255, 255];
@@ -131,6 +132,8 @@ fn steep_flight(scene: &diamantina_protocol::message::Scene) -> FlightPath {
 }
 
 /// Flies 300 frames through a network and looks at each pixel of each.
+///
+/// How many frames lacked data, and the sorted milliseconds of their cuts.
 fn fly_over_magenta(world: &World, faults: Faults, seed: u64) -> (usize, Vec<f64>) {
     let proxy = Proxy::start(&world.served.address, faults, seed);
     let fetch = diamantina_client::fetch::Options::default();
@@ -153,6 +156,7 @@ fn fly_over_magenta(world: &World, faults: Faults, seed: u64) -> (usize, Vec<f64
     })
     .unwrap();
     assert!(begun, "nothing was ever drawn");
+    assert!(proxy.faults_done.load(Ordering::Relaxed) > 0, "the network behaved");
     cuts.sort_by(f64::total_cmp);
     (unfinished, cuts)
 }

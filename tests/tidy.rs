@@ -232,7 +232,7 @@ fn the_gpu_and_the_serialisation_are_each_named_in_one_place() {
     };
     judge("client", "wgpu::", &["render", "viewer", "headless", "web"]);
     judge("server", "wgpu", &[]);
-    judge("protocol", "bincode", &["wire", "index"]);
+    judge("protocol", "bincode", &["wire"]);
     judge("server", "bincode", &[]);
     judge("client", "bincode", &[]);
 }

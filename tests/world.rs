@@ -238,7 +238,7 @@ pub(crate) struct Faults {
 pub(crate) struct Proxy {
     /// `http://127.0.0.1:PORT`.
     pub(crate) address: String,
-    /// Connections that were cut or stalled so far.
+    /// Connections that were cut or fell silent so far.
     pub(crate) faults_done: Arc<AtomicU64>,
 }
 
