@@ -128,7 +128,7 @@ fn assert_no_cracks(layer: &Layer, items: &[DrawItem], clipped: bool) -> usize {
 fn any_cut_of_a_built_store_with_anything_missing_has_no_cracks() {
     let folder = tempfile::tempdir().unwrap();
     let dem = folder.path().join("dem.raw");
-    let ingest = write_raw(&dem, [1100, 300], islands);
+    let ingest = write_raw(&dem, [1700, 300], islands);
     let mut dice = Dice(20);
     let mut shared = 0;
     for (patch_log2, max_error) in [(5, 0.0), (5, 2.0), (6, 1.0)] {
@@ -136,7 +136,8 @@ fn any_cut_of_a_built_store_with_anything_missing_has_no_cracks() {
         build(&dem, &store, &ingest, &hierarchy::Options { max_error, patch_log2, ..options() });
         let Loaded { layer, entries, surfaces } = load(&Store::open(&store).unwrap());
         let forest = layer.forest;
-        assert!(forest.roots()[0] >= 3, "several roots");
+        assert!(forest.roots()[0] >= 4, "several roots");
+        // Saturation reaches a root square's width beyond the last height, so the fourth is the first empty one.
         let roots: Vec<Entry> = forest.root_diamonds().map(|root| entries[&root]).collect();
         assert!(roots.iter().any(Entry::is_empty), "an empty root: {roots:?}");
         let [low, high] = [layer.position([0, 0]), layer.position(layer.samples)];
