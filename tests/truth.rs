@@ -220,6 +220,26 @@ struct Case<'a> {
     rule: Rule,
 }
 
+/// Compares every diamond of every level with the samples.
+fn judge(store: &Store, entries: &HashMap<Diamond, Entry>, samples: &Samples) -> Verdict {
+    let layer = &store.scene().layers[0];
+    let verdict = Verdict::default();
+    let check = Check { layer, forest: layer.forest, samples, entries, verdict: &verdict };
+    for root in layer.forest.root_diamonds().filter(|root| entries[root].is_empty()) {
+        let [low, high] = layer.forest.bounds(root);
+        let all =
+            (low[1]..=high[1]).flat_map(|y| (low[0]..=high[0]).map(move |x| (i64::from(x), i64::from(y))));
+        for (x, y) in all.filter(|(x, y)| !samples.at(*x, *y).is_nan()) {
+            verdict.wrong(|| format!("a sample at {x}, {y} in root {root:?}, said to be empty"));
+        }
+    }
+    inspect::decode_levels(store, 0, layer, entries, |_, blocks| {
+        blocks.par_iter().for_each(|(d, block, _)| check.split(*d, block));
+    })
+    .unwrap();
+    verdict
+}
+
 /// Builds, and checks every diamond of every level.
 fn check(case: &Case<'_>, samples: &Samples) {
     let started = Instant::now();
@@ -251,20 +271,7 @@ fn check(case: &Case<'_>, samples: &Samples) {
         layer.quantum
     );
     let entries = inspect::entries(&store, 0, layer).unwrap();
-    let verdict = Verdict::default();
-    let check = Check { layer, forest: layer.forest, samples, entries: &entries, verdict: &verdict };
-    for root in layer.forest.root_diamonds().filter(|root| entries[root].is_empty()) {
-        let [low, high] = layer.forest.bounds(root);
-        let all =
-            (low[1]..=high[1]).flat_map(|y| (low[0]..=high[0]).map(move |x| (i64::from(x), i64::from(y))));
-        for (x, y) in all.filter(|(x, y)| !samples.at(*x, *y).is_nan()) {
-            verdict.wrong(|| format!("a sample at {x}, {y} in root {root:?}, said to be empty"));
-        }
-    }
-    inspect::decode_levels(&store, 0, layer, &entries, |_, blocks| {
-        blocks.par_iter().for_each(|(d, block, _)| check.split(*d, block));
-    })
-    .unwrap();
+    let verdict = judge(&store, &entries, samples);
     let compared = verdict.compared.load(Ordering::Relaxed);
     let line = format!(
         "{name}: {compared} comparisons in {} levels, {:.1} s to build, {:.1} s to check",
@@ -320,7 +327,7 @@ fn every_sample_of_every_real_dem_is_within_the_declared_error_at_every_level() 
     let Some(folder) = data() else { return };
     let mut seen = 0;
     for (dem, ingest) in dems(&folder) {
-        let source = ingest::open(&[dem.clone()], &ingest).unwrap();
+        let source = ingest::open(std::slice::from_ref(&dem), &ingest).unwrap();
         let large = source.grid().width as usize * source.grid().height as usize > LARGE;
         drop(source);
         check_all(&dem, &ingest, if large { &CASES[2..3] } else { &CASES });
@@ -349,4 +356,24 @@ fn a_made_archipelago_is_within_the_declared_error_at_every_level() {
     let dem = folder.path().join("dem.raw");
     let ingest = crate::world::write_raw(&dem, [700, 300], crate::seams::islands);
     check_all(&dem, &ingest, &CASES);
+}
+
+#[test]
+fn an_error_declared_a_tenth_too_small_would_be_found_at_every_level() {
+    let folder = tempfile::tempdir().unwrap();
+    let (dem, store) = (folder.path().join("dem.raw"), folder.path().join("store"));
+    // Without holes, so that heights alone decide.
+    let ingest = crate::world::write_raw(&dem, [513, 513], |x, y| {
+        Some((f64::from(x) / 9.0).sin().mul_add(100.0, (f64::from(y) / 5.0).cos() * 70.0) as f32)
+    });
+    build(&dem, &store, &ingest, &options());
+    let samples = Samples::read(&ingest::open(&[dem], &ingest).unwrap());
+    let store = Store::open(&store).unwrap();
+    let entries = inspect::entries(&store, 0, &store.scene().layers[0]).unwrap();
+    assert_eq!(judge(&store, &entries, &samples).wrong.into_inner(), 0);
+    for level in 1..store.scene().layers[0].forest.levels() {
+        let mut less = entries.clone();
+        less.iter_mut().filter(|(d, _)| d.level() == level).for_each(|(_, e)| e.error_metres *= 0.9);
+        assert!(judge(&store, &less, &samples).wrong.into_inner() > 0, "level {level}");
+    }
 }
