@@ -3,7 +3,8 @@
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use diamantina_protocol::message::{Kind, is_name};
 use diamantina_protocol::points::Rule;
-use diamantina_server::hierarchy::{self, Report};
+use diamantina_server::hierarchy::{self, BuildError, Report};
+use diamantina_server::ingest::IngestError;
 use diamantina_server::inspect::{self, Inspection};
 use diamantina_server::progress::Progress;
 use diamantina_server::store::Store;
@@ -44,7 +45,7 @@ struct BuildArgs {
     #[arg(short, long, value_name = "STORE")]
     output: PathBuf,
     /// The largest error at the finest level, in metres; 0 is lossless (floats: to the quantum)
-    #[arg(long, default_value_t = 0.0, value_name = "METRES")]
+    #[arg(long, default_value_t = 0.0, value_name = "METRES", allow_negative_numbers = true)]
     max_error: f64,
     /// The most memory to use
     #[arg(long, default_value = "2GiB", value_name = "BYTES", value_parser = parse_bytes)]
@@ -59,7 +60,7 @@ struct BuildArgs {
     #[arg(long, default_value = "smooth", value_enum)]
     rule: RuleName,
     /// Metres of the unit in which heights are stored [default: the source's own unit, or found from it]
-    #[arg(long, value_name = "METRES")]
+    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
     quantum: Option<f64>,
     /// Segments along each side of a patch
     #[arg(long, default_value = "64", value_name = "N", value_parser = ["32", "64", "128"])]
@@ -223,8 +224,9 @@ fn build(args: BuildArgs) -> Result<(), Failure> {
         },
         memory: args.memory,
     };
-    let source = ingest::open(&args.sources, &args.ingest)?;
-    let report = hierarchy::build(&source, &args.output, &options, &Progress::new())?;
+    let source = ingest::open(&args.sources, &args.ingest).map_err(|e| refuse_build(&[], e.into()))?;
+    let report = hierarchy::build(&source, &args.output, &options, &Progress::new())
+        .map_err(|e| refuse_build(&args.sources, e))?;
     let mut out = std::io::stdout().lock();
     if args.json {
         writeln!(out, "{}", serde_json::to_string_pretty(&report)?)?;
@@ -232,6 +234,23 @@ fn build(args: BuildArgs) -> Result<(), Failure> {
         print_report(&mut out, &args.output, &report)?;
     }
     Ok(())
+}
+
+/// Options that make no sense, or not for this source, are wrong use; all else is failure.
+fn refuse_build(sources: &[PathBuf], error: BuildError) -> Failure {
+    let wrong_use = matches!(
+        error,
+        BuildError::MaxError { .. }
+            | BuildError::Quantum(_)
+            | BuildError::Memory { .. }
+            | BuildError::Ingest(IngestError::Options { .. })
+    );
+    // What the heights themselves are to blame for names where they came from.
+    let about_heights = matches!(error, BuildError::AllNodata(_) | BuildError::Range { .. });
+    let names: Vec<String> =
+        sources.iter().filter(|_| about_heights).map(|s| s.display().to_string()).collect();
+    let from = if names.is_empty() { String::new() } else { format!("{}: ", names.join(", ")) };
+    Failure(if wrong_use { 2 } else { 1 }, format!("{from}{error}"))
 }
 
 fn print_report(out: &mut impl Write, store: &Path, report: &Report) -> std::io::Result<()> {
