@@ -28,7 +28,7 @@ struct Layer {
     cell: vec2<f32>,
     // Metres from the eye to the reference point of the lattice, a point near the eye.
     offset: vec2<f32>,
-    // Metres of a quantum.
+    // Metres of a quantum, stretched.
     quantum: f32,
     // Metres from the eye up to the reference height, a height near the eye's.
     up_offset: f32,
@@ -36,10 +36,12 @@ struct Layer {
     height: i32,
     // 1 / depth of the deepest point, in metres; 0 where the layer has no sea.
     per_depth: f32,
-    // The lowest height of land, in metres, and 1 / its range.
+    // The lowest height of land, in metres, and parts of the ramp for a metre above it.
     land_base: f32,
     per_height: f32,
-    unused: vec2<f32>,
+    // What heights are multiplied by.
+    exaggeration: f32,
+    unused: f32,
 }
 
 @group(0) @binding(0) var<uniform> frame: Frame;
