@@ -63,9 +63,11 @@ fn haze_to(up: f32, distance: f32) -> f32 {
     return 1.0 - exp(-frame.horizon.w * density * distance);
 }
 
-// The light that a surface sends back: the sun, and the sky's half sphere, brighter from above.
+// The light that a surface sends back: the sun, and the sky's half sphere, brighter from above. The sun
+// fades out softly, as it does on rough ground: a sharp edge of light would follow the mesh.
 fn lit(albedo: vec3<f32>, normal: vec3<f32>) -> vec3<f32> {
-    let sun = vec3<f32>(1.08, 1.04, 0.97) * max(dot(normal, frame.sun.xyz), 0.0);
+    let towards = dot(normal, frame.sun.xyz);
+    let sun = vec3<f32>(1.08, 1.04, 0.97) * (0.5 * (towards + sqrt(towards * towards + 0.02)));
     let sky = vec3<f32>(0.25, 0.28, 0.34) * (0.5 + 0.5 * normal.z);
     return albedo * (sun + sky);
 }

@@ -48,9 +48,10 @@ struct ViewArgs {
     /// Memory for decoded diamonds
     #[arg(long, default_value = "1024", value_name = "MIB")]
     memory: usize,
-    /// Where the sun stands: degrees clockwise from north, degrees above the horizon
-    #[arg(long, default_value = "315,45", value_name = "AZIMUTH,ALTITUDE", value_parser = parse_pair)]
-    sun: [f64; 2],
+    /// Where the sun stands: degrees clockwise from north, degrees above the horizon [default: 315,45; 315,20
+    /// on other bodies than the Earth]
+    #[arg(long, value_name = "AZIMUTH,ALTITUDE", value_parser = parse_pair)]
+    sun: Option<[f64; 2]>,
     /// What is behind the terrain: sky, or a colour as six hexadecimal digits [default: sky; black on other
     /// bodies than the Earth]
     #[arg(long, value_name = "sky|RRGGBB", value_parser = parse_background)]
@@ -228,7 +229,10 @@ impl ViewArgs {
         let look = Look::of(scene);
         Look {
             background: self.background.unwrap_or(look.background),
-            sun: Sun { azimuth_degrees: self.sun[0], altitude_degrees: self.sun[1] },
+            sun: self.sun.map_or(look.sun, |[azimuth_degrees, altitude_degrees]| Sun {
+                azimuth_degrees,
+                altitude_degrees,
+            }),
             colours: match self.colours {
                 ColourName::Auto => look.colours,
                 ColourName::Terrain => Colours::Terrain,

@@ -94,7 +94,8 @@ impl Default for Look {
 }
 
 impl Look {
-    /// How a scene looks unless told otherwise: other bodies than the Earth are grey, without air.
+    /// How a scene looks unless told otherwise: other bodies than the Earth are grey, without air, and the sun
+    /// stands low, as plains of dust show little relief else.
     #[must_use]
     pub fn of(scene: &Scene) -> Self {
         let radius = scene.frame.crs.as_ref().and_then(|crs| crs.proj4.as_deref()).and_then(radius);
@@ -102,7 +103,8 @@ impl Look {
             return Self::default();
         }
         let black = Background::Colour([0.003, 0.003, 0.004, 1.0]);
-        Self { background: black, colours: Colours::Grey, haze: 0.0, ..Self::default() }
+        let sun = Sun { altitude_degrees: 20.0, ..Sun::default() };
+        Self { background: black, sun, colours: Colours::Grey, haze: 0.0, ..Self::default() }
     }
 }
 
