@@ -3,6 +3,13 @@
 //! Positions are `f64` in the frame's metres (x east, y north, z up); only what is relative to the eye is
 //! ever handed to the GPU as `f32`, so a scene may lie millions of metres from its origin.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    reason = "what is relative to the eye needs no more than f32"
+)]
+
 use glam::{DMat3, DVec3, Mat4, Vec4};
 
 /// A perspective camera whose up is the frame's up.

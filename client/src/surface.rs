@@ -3,6 +3,13 @@
 //! Slopes follow the same rule as heights: a split changes only what lies strictly inside, so two
 //! surfaces that meet along a side agree about its shading too, and light shows no seams.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    reason = "local coordinates are at most 256, and slopes need no more than f32"
+)]
+
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::{Block, Diamond, walk_shared};
 use diamantina_protocol::message::Layer;

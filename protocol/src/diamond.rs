@@ -24,6 +24,13 @@
 //! After Cignoni et al., *BDAM: Batched Dynamic Adaptive Meshes* (2003), and Gobbetti et al., *C-BDAM*
 //! (2006), whose diamonds these are.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    reason = "lattice coordinates are below 2^28 and local ones at most 256: nothing is lost between u32, i64 and usize"
+)]
+
 use crate::NODATA;
 use crate::bintree::{Forest, Point};
 
@@ -78,10 +85,10 @@ impl Forest {
     fn frame(&self, d: Diamond) -> ([[i64; 2]; 2], [[i64; 2]; 2]) {
         let h = 1i64 << (self.root_log2() - 1 - u32::from(d.level) / 2);
         let (x, y) = (i64::from(d.x), i64::from(d.y));
-        if d.level % 2 == 0 {
+        if d.level.is_multiple_of(2) {
             // Diagonals of the squares alternate: they join points whose coordinates, in squares, sum to
             // an even number.
-            if (d.x / (2 * h as u32) + d.y / (2 * h as u32)) % 2 == 0 {
+            if (d.x / (2 * h as u32) + d.y / (2 * h as u32)).is_multiple_of(2) {
                 ([[x - h, y - h], [x + h, y + h]], [[x + h, y - h], [x - h, y + h]])
             } else {
                 ([[x + h, y - h], [x - h, y + h]], [[x + h, y + h], [x - h, y - h]])
@@ -157,7 +164,7 @@ impl Forest {
         let (columns, rows) = (w / h, height / h);
         (0..=rows).flat_map(move |j| {
             (0..=columns).filter_map(move |i| {
-                let fits = if level % 2 == 0 { i % 2 == 1 && j % 2 == 1 } else { i % 2 != j % 2 };
+                let fits = if level.is_multiple_of(2) { i % 2 == 1 && j % 2 == 1 } else { i % 2 != j % 2 };
                 if fits { forest.diamond([i * h, j * h]).filter(|d| d.level() == level) } else { None }
             })
         })
@@ -169,7 +176,7 @@ impl Forest {
     pub fn hypotenuse(&self, level: u32) -> [f64; 2] {
         let spacing = f64::from(1u32 << (self.root_log2() - self.patch_log2() - level / 2));
         // An odd level's cells are turned by 45 degrees: their hypotenuse lies along one axis.
-        if level % 2 == 0 { [spacing, spacing] } else { [spacing, 0.0] }
+        if level.is_multiple_of(2) { [spacing, spacing] } else { [spacing, 0.0] }
     }
 }
 
@@ -254,7 +261,7 @@ impl Block {
     /// Position in [`Block::heights`] of doubled local coordinates, both even or both odd, in 0..=2n.
     #[must_use]
     pub fn slot(n: usize, p: usize, q: usize) -> usize {
-        if p % 2 == 0 { q / 2 * (n + 1) + p / 2 } else { (n + 1) * (n + 1) + q / 2 * n + p / 2 }
+        if p.is_multiple_of(2) { q / 2 * (n + 1) + p / 2 } else { (n + 1) * (n + 1) + q / 2 * n + p / 2 }
     }
 
     /// Fills in, from `parent`'s split, the old points of `child` that lie in the triangle they share.
@@ -267,24 +274,13 @@ impl Block {
 
     /// Reads every point of the block from the lattice: `height(x, y)`. Points outside stay empty.
     pub fn fill(&mut self, local: &Local, mut height: impl FnMut(u32, u32) -> i32) {
-        let n = self.n as i64;
-        let side = self.n + 1;
-        for v in 0..=n {
-            for u in 0..=if local.upper { n } else { n } {
-                if !local.upper && v > u {
-                    continue;
+        let n = self.n;
+        for q in 0..=2 * n {
+            for p in (q % 2..=2 * n).step_by(2) {
+                if local.upper || q <= p {
+                    let [x, y] = local.lattice2([p as i64, q as i64]);
+                    self.heights[Self::slot(n, p, q)] = height(x as u32, y as u32);
                 }
-                let [x, y] = local.lattice2([2 * u, 2 * v]);
-                self.heights[v as usize * side + u as usize] = height(x as u32, y as u32);
-            }
-        }
-        for v in 0..n {
-            for u in 0..n {
-                if !local.upper && v > u {
-                    continue;
-                }
-                let [x, y] = local.lattice2([2 * u + 1, 2 * v + 1]);
-                self.heights[side * side + v as usize * self.n + u as usize] = height(x as u32, y as u32);
             }
         }
     }

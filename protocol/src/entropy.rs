@@ -56,13 +56,14 @@ impl Context {
         // 1/2 would forget the prior at once; start at 1/4.
         const RATE: [u16; 32] = rates();
         let rate = u32::from(RATE[usize::from(self.seen.min(31))]);
-        let zero = u32::from(self.zero);
-        let moved = if bit { zero - (zero * rate >> 16) } else { zero + ((65535 - zero) * rate >> 16) };
-        self.zero = moved.min(65535) as u16;
+        // A share of what it has, so it stays within 16 bits.
+        let share = |of: u16| u16::try_from((u32::from(of) * rate) >> 16).unwrap_or(of);
+        self.zero = if bit { self.zero - share(self.zero) } else { self.zero + share(u16::MAX - self.zero) };
         self.seen = self.seen.saturating_add(1);
     }
 }
 
+#[allow(clippy::cast_possible_truncation, reason = "65536 divided by at least 4")]
 const fn rates() -> [u16; 32] {
     let mut table = [0u16; 32];
     let mut i = 0;

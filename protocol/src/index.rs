@@ -13,7 +13,7 @@
 
 use crate::bintree::Forest;
 use crate::diamond::Diamond;
-use crate::wire::{self, WireError};
+use crate::wire::{self, Decode, Encode, WireError};
 
 /// Depths of the quadtree in a page: at most 341 squares, 1087 diamonds.
 pub const BAND: u32 = 5;
@@ -51,7 +51,7 @@ impl Entry {
 }
 
 /// The columns of a page.
-#[derive(bincode::Encode, bincode::Decode)]
+#[derive(Encode, Decode)]
 struct Columns {
     format: u32,
     errors: Vec<u16>,
@@ -272,7 +272,7 @@ mod tests {
     }
 
     fn entries(count: usize) -> Vec<Entry> {
-        (0..count as i32)
+        (0..i32::try_from(count).unwrap())
             .map(|i| {
                 if i % 7 == 3 {
                     Entry::EMPTY

@@ -27,6 +27,13 @@
 //!
 //! History: format 1 is the first.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    reason = "a block has fewer than 2^16 points and its symbols fewer than 2^32 bytes"
+)]
+
 use crate::bintree::Forest;
 use crate::diamond::{Block, Diamond};
 use crate::entropy::{Context, Decoder, Encoder, Magnitude};
@@ -582,6 +589,7 @@ fn walk_corrections<P: Pass>(
     for v in 1..n {
         let mut west = 0;
         // Of a diamond at the border the hypotenuse itself is inside: nobody else has it.
+        #[allow(clippy::needless_range_loop, reason = "u is a coordinate first")]
         for u in if upper { 1 } else { v }..n {
             let slot = v * row + u;
             let place = place(n, 2 * u, 2 * v);

@@ -4,6 +4,8 @@
 //! varints of at most ten bytes. The crate below is complete but no longer maintained, so nothing else
 //! may name it; to replace it, replace this file and raise the formats of what goes through it.
 
+pub(crate) use bincode::{Decode, Encode};
+
 use bincode::config::{Configuration, Limit, LittleEndian, Varint};
 
 /// Why bytes are not the value that was asked for.

@@ -2,6 +2,14 @@
 //! the bound holds at every sample (law 3), the receiver has what the sender had (law 4), and decoders
 //! take any bytes (law 6). Law 1 is tested in `bintree.rs` and here for diamonds.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    clippy::unwrap_used,
+    reason = "fields of a few hundred points, made here"
+)]
+
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::{Block, Diamond};

@@ -88,12 +88,12 @@ impl Canvas {
         let row = self.planes[0].width as usize;
         let mut bytes = Vec::new();
         for (j, plane) in self.planes.iter().enumerate() {
-            let step = 1usize << j;
+            let (step, wide) = (1u32 << j, 1usize << j);
             // Rows of this plane among those given lie one behind the other in its file.
-            let first = y0.next_multiple_of(step as u32);
+            let first = y0.next_multiple_of(step);
             bytes.clear();
-            for line in heights.chunks_exact(row).skip((first - y0) as usize).step_by(step) {
-                bytes.extend(line.iter().step_by(step).flat_map(|h| h.to_le_bytes()));
+            for line in heights.chunks_exact(row).skip((first - y0) as usize).step_by(wide) {
+                bytes.extend(line.iter().step_by(wide).flat_map(|h| h.to_le_bytes()));
             }
             if !bytes.is_empty() {
                 plane.file.write_all_at(&bytes, u64::from(first >> j) * u64::from(plane.width) * 4)?;
@@ -138,7 +138,7 @@ mod tests {
     fn every_plane_holds_the_multiples_of_its_spacing() {
         let folder = tempfile::tempdir().unwrap();
         let canvas = Canvas::create(folder.path(), 21, 13, 3).unwrap();
-        let height = |x: u32, y: u32| (x * 100 + y) as i32;
+        let height = |x: u32, y: u32| (x * 100 + y).cast_signed();
         // In bands that do not line up with the spacings, and out of order.
         for (y0, rows) in [(5, 8), (0, 5)] {
             let band: Vec<i32> = (y0..y0 + rows).flat_map(|y| (0..21).map(move |x| height(x, y))).collect();

@@ -1,5 +1,12 @@
 //! The height at a place: the finest surface's, found by decoding the ancestors of one diamond.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    reason = "places are checked to lie on the lattice before they become whole numbers"
+)]
+
 use crate::inspect::read_page;
 use crate::projection::Projection;
 use crate::store::{Key, Kind, Store, StoreError};

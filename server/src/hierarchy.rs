@@ -12,7 +12,15 @@
 //!
 //! Everything written is a function of the source and the options, whatever the number of threads.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    reason = "lattice coordinates are below 2^28, sizes within the memory that was granted, and heights are checked against the range of quanta before they become integers"
+)]
+
 use crate::canvas::{Canvas, Window};
+use crate::chunks::Chunks;
 use crate::ingest::{Grid, IngestError, Source};
 use crate::measure::{Found, Samples, measure};
 use crate::progress::Progress;
@@ -24,7 +32,7 @@ use diamantina_protocol::index::{self, Entry};
 use diamantina_protocol::message::{Crs, Frame, Kind, Layer, Scene};
 use diamantina_protocol::points::{self, Coding, CodingError, Rule, SOURCE_MAX, STEP_MAX};
 use rayon::prelude::*;
-use std::collections::{BTreeSet, HashMap};
+use std::collections::HashMap;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -207,9 +215,8 @@ pub fn build(
 #[derive(Debug, Clone, Copy)]
 struct Plan {
     forest: Forest,
-    /// Depth of the quadtree whose squares are the chunks; the diamonds of twice this level are centred
-    /// in them.
-    depth: u32,
+    /// The squares that are built one by one.
+    chunks: Chunks,
     /// Rows that are read at once, as a share of the memory.
     band_bytes: u64,
     /// Chunks that may be worked on at once.
@@ -238,41 +245,14 @@ impl Plan {
             return Err(BuildError::Memory { asked: memory, needed });
         }
         let workers = ((memory - base - coarse_bytes(chunk_log2)) / 2 / chunk_bytes).clamp(1, threads);
-        let depth = forest.root_log2() - chunk_log2;
-        Ok(Self { forest, depth, band_bytes: memory / 8 / threads, workers: workers as usize })
-    }
-
-    /// The first level that is coded chunk by chunk.
-    fn chunk_level(&self) -> u32 {
-        2 * self.depth
-    }
-
-    fn chunk_log2(&self) -> u32 {
-        self.forest.root_log2() - self.depth
+        let chunks = Chunks::new(forest, chunk_log2);
+        Ok(Self { forest, chunks, band_bytes: memory / 8 / threads, workers: workers as usize })
     }
 
     /// Base-2 logarithm of the spacing of the lattice of a level: that of the canvas plane with all its
     /// points. Of an odd level half of the plane's points are its own.
     fn spacing_log2(&self, level: u32) -> u32 {
         self.forest.root_log2() - self.forest.patch_log2() - level.div_ceil(2)
-    }
-
-    /// South-west corners of all chunks.
-    fn chunks(&self) -> Vec<[u32; 2]> {
-        let [w, h] = self.forest.size();
-        let side = 1u32 << self.chunk_log2();
-        (0..h / side).flat_map(|j| (0..w / side).map(move |i| [i * side, j * side])).collect()
-    }
-
-    /// Whether the chunk at `corner` is the one that writes a diamond: it contains the centre, or the
-    /// centre lies on the forest's own east or north border and it touches that.
-    fn owns(&self, corner: [u32; 2], d: Diamond) -> bool {
-        let side = 1u32 << self.chunk_log2();
-        let size = self.forest.size();
-        (0..2).all(|axis| {
-            let at = d.centre()[axis].min(size[axis] - 1);
-            (corner[axis]..corner[axis] + side).contains(&at)
-        })
     }
 }
 
@@ -353,7 +333,7 @@ fn transcribe(
     let grid = source.grid();
     let quantum = find_quantum(source, options)?;
     let work = |error: io::Error| BuildError::Work { path: folder.to_owned(), error };
-    let coarsest = plan.spacing_log2(plan.chunk_level());
+    let coarsest = plan.spacing_log2(plan.chunks.level());
     let canvas = Canvas::create(folder, grid.width, grid.height, coarsest).map_err(work)?;
     let rows = (plan.band_bytes / 16 / u64::from(grid.width)).clamp(1, 256) as u32;
     progress.stage("read", u64::from(grid.width) * u64::from(grid.height));
@@ -441,7 +421,7 @@ fn exponents(plan: &Plan, canvas: &Canvas, fine_step: u32) -> io::Result<Vec<u8>
 /// them, over a spread of windows.
 fn detail(plan: &Plan, canvas: &Canvas, level: u32) -> io::Result<f64> {
     let forest = &plan.forest;
-    let plane = plan.spacing_log2(level + 1).min(plan.spacing_log2(plan.chunk_level()));
+    let plane = plan.spacing_log2(level + 1).min(plan.spacing_log2(plan.chunks.level()));
     let step = 1u32 << plan.spacing_log2(level + 1);
     let [w, h] = forest.size();
     let side = (256 * step).min(w).min(h);
@@ -614,7 +594,7 @@ impl Build<'_> {
     fn coarse_levels(&self) -> Result<Coarse, BuildError> {
         let forest = &self.plan.forest;
         let size = forest.size();
-        let chunk_level = self.plan.chunk_level();
+        let chunk_level = self.plan.chunks.level();
         let plane = self.plan.spacing_log2(chunk_level);
         let window = self.canvas.read(plane, [0, 0], size).map_err(self.work())?;
         let mut surfaces = vec![Surface::new(self.plan.spacing_log2(0), [0, 0], size)];
@@ -646,8 +626,8 @@ impl Build<'_> {
 
     /// Codes all chunks.
     fn chunks(&self, coarse: &Coarse, progress: &Progress) -> Result<(), BuildError> {
-        let chunks = self.plan.chunks();
-        let cells = 1u64 << (2 * self.plan.chunk_log2());
+        let chunks = self.plan.chunks.corners();
+        let cells = 1u64 << (2 * self.plan.chunks.side_log2());
         progress.stage("build", chunks.len() as u64 * cells);
         let next = std::sync::atomic::AtomicUsize::new(0);
         // As many workers as the memory allows, each taking the next chunk when it is done with one.
@@ -663,7 +643,7 @@ impl Build<'_> {
     /// Codes the diamonds that a chunk owns and compares its samples with the surface of every level.
     fn chunk(&self, corner: [u32; 2], coarse: &Coarse) -> Result<(), BuildError> {
         let forest = &self.plan.forest;
-        let side = 1u32 << self.plan.chunk_log2();
+        let side = 1u32 << self.plan.chunks.side_log2();
         let cells = [side, side];
         let far = corner.map(|w| w + side);
         // Beyond the source there is nothing, but for what straddles the border by half a chunk.
@@ -677,11 +657,12 @@ impl Build<'_> {
         if !samples.is_empty() {
             let heights: Vec<i32> = samples.rows().flatten().copied().collect();
             let samples = Samples { origin: corner, cells, heights: &heights };
-            let coarse_levels = coarse.surfaces.iter().take(self.plan.chunk_level() as usize + 1).enumerate();
+            let coarse_levels =
+                coarse.surfaces.iter().take(self.plan.chunks.level() as usize + 1).enumerate();
             for (level, surface) in coarse_levels.skip(1) {
                 measure(forest, level as u32, samples, |x, y| surface.at(x, y), &mut found);
             }
-            let first = self.plan.chunk_level() + 1;
+            let first = self.plan.chunks.level() + 1;
             for (level, surface) in (first..forest.levels()).zip(&surfaces) {
                 measure(forest, level, samples, |x, y| surface.at(x, y), &mut found);
             }
@@ -717,11 +698,11 @@ impl Build<'_> {
         coarse: &Coarse,
     ) -> Result<(Vec<(Diamond, Coded)>, Vec<Surface>), BuildError> {
         let forest = &self.plan.forest;
-        let side = 1u32 << self.plan.chunk_log2();
-        let needed = needed(&self.plan, corner);
+        let side = 1u32 << self.plan.chunks.side_log2();
+        let needed = self.plan.chunks.needed(corner);
         let (mut ranges, mut surfaces) = (Vec::new(), Vec::new());
         let mut before: HashMap<Diamond, Block> = HashMap::new();
-        for (level, diamonds) in (self.plan.chunk_level()..).zip(&needed) {
+        for (level, diamonds) in (self.plan.chunks.level()..).zip(&needed) {
             let spacing = self.plan.spacing_log2(level + 1);
             let bounds = diamonds.iter().map(|d| forest.bounds(*d)).reduce(|[a, b], [c, d]| {
                 [[a[0].min(c[0]), a[1].min(c[1])], [b[0].max(d[0]), b[1].max(d[1])]]
@@ -732,7 +713,7 @@ impl Build<'_> {
             let mut here = HashMap::new();
             for d in diamonds {
                 let mut block = inherited(forest, &before, *d);
-                if level == self.plan.chunk_level() && level > 0 {
+                if level == self.plan.chunks.level() && level > 0 {
                     // The chunks' own level starts from what the coarse levels left.
                     if let Some(last) = coarse.surfaces.last() {
                         let mut whole = Block::empty(forest);
@@ -744,7 +725,7 @@ impl Build<'_> {
                     }
                 }
                 let source = self.source_block(*d, &window);
-                if self.plan.owns(corner, *d) {
+                if self.plan.chunks.owns(corner, *d) {
                     ranges.push(self.code(*d, &mut block, &source)?);
                 } else {
                     points::quantise(forest, &self.coding, *d, &mut block, &source);
@@ -853,36 +834,4 @@ fn inherited(forest: &Forest, before: &HashMap<Diamond, Block>, d: Diamond) -> B
         }
     }
     block
-}
-
-/// The diamonds that a chunk must compute, by level from the chunks' own: all that overlap it, and their
-/// ancestors.
-fn needed(plan: &Plan, corner: [u32; 2]) -> Vec<BTreeSet<Diamond>> {
-    let forest = &plan.forest;
-    let side = 1u32 << plan.chunk_log2();
-    let far = corner.map(|w| w + side);
-    let mut levels = vec![BTreeSet::new(); (forest.levels() - plan.chunk_level()) as usize];
-    // Downward: children of what overlaps, if they overlap.
-    let overlaps = |d: Diamond| {
-        let [low, high] = forest.bounds(d);
-        (0..2).all(|axis| low[axis] < far[axis] && high[axis] > corner[axis])
-    };
-    if let (Some(first), Some(own)) = (levels.first_mut(), forest.diamond(corner.map(|w| w + side / 2))) {
-        first.insert(own);
-    }
-    for i in 1..levels.len() {
-        let next: BTreeSet<_> = levels[i - 1]
-            .iter()
-            .flat_map(|d| forest.children(*d))
-            .flatten()
-            .filter(|d| overlaps(*d))
-            .collect();
-        levels[i] = next;
-    }
-    // Upward: the other parents of what straddles the border.
-    for i in (1..levels.len()).rev() {
-        let parents: Vec<_> = levels[i].iter().flat_map(|d| forest.parents(*d)).collect();
-        levels[i - 1].extend(parents);
-    }
-    levels
 }

@@ -1,7 +1,7 @@
 //! What a store holds: levels, bytes, errors; and, on request, whether every blob is intact.
 
+use crate::chunks::Chunks;
 use crate::store::{Key, Kind, Store, StoreError};
-use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::index::{self, Entry, PageError};
 use diamantina_protocol::message::{Layer, Scene};
@@ -9,6 +9,9 @@ use diamantina_protocol::points::{self, DecodeError, Tally};
 use rayon::prelude::*;
 use serde::Serialize;
 use std::collections::HashMap;
+
+/// Base-2 logarithm of the side of the chunks that are verified at once: some tens of megabytes each.
+const VERIFY_CHUNK_LOG2: u32 = 10;
 
 /// Why a store could not be inspected, or what is wrong with it.
 #[derive(Debug, thiserror::Error)]
@@ -248,26 +251,84 @@ fn summary(
     }
 }
 
-/// Decodes every diamond of a layer, level by level; the real and the fictitious points.
+/// A layer's payloads, to be decoded.
+struct Payloads<'a> {
+    store: &'a Store,
+    number: u8,
+    layer: &'a Layer,
+    entries: &'a HashMap<Diamond, Entry>,
+}
+
+impl Payloads<'_> {
+    /// Decodes some diamonds of a level, given the blocks of the level before. Diamonds without any height
+    /// are left out.
+    fn decode(
+        &self,
+        diamonds: impl IntoParallelIterator<Item = Diamond>,
+        before: &HashMap<Diamond, Block>,
+    ) -> Result<Vec<(Diamond, Block, Tally)>, InspectError> {
+        let forest = &self.layer.forest;
+        let filled = diamonds.into_par_iter().filter(|d| self.entries.get(d).is_some_and(|e| !e.is_empty()));
+        filled
+            .map(|d| {
+                let mut block = Block::empty(forest);
+                for parent in forest.parents(d) {
+                    if let Some(from) = before.get(&parent) {
+                        block.inherit(forest, d, parent, from);
+                    }
+                }
+                let [a, b] = d.centre();
+                let (layer, centre) = (|| self.layer.name.clone(), [a, b]);
+                let payload = self.store.get(Key { layer: self.number, kind: Kind::Points, a, b })?;
+                if payload.is_none() && self.entries.get(&d).is_some_and(|e| e.bytes > 0) {
+                    return Err(InspectError::NoPoints { layer: layer(), centre });
+                }
+                let tally =
+                    points::decode(forest, &self.layer.coding, d, &mut block, &payload.unwrap_or_default())
+                        .map_err(|error| InspectError::Points { layer: layer(), centre, error })?;
+                Ok((d, block, tally))
+            })
+            .collect()
+    }
+}
+
+fn blocks(decoded: Vec<(Diamond, Block, Tally)>) -> HashMap<Diamond, Block> {
+    decoded.into_iter().map(|(d, block, _)| (d, block)).collect()
+}
+
+/// Decodes every diamond of a layer, chunk by chunk; the real and the fictitious points.
 fn verify_layer(
     store: &Store,
     number: u8,
     layer: &Layer,
     entries: &HashMap<Diamond, Entry>,
 ) -> Result<(u64, u64), InspectError> {
-    let (mut real, mut fictitious) = (0, 0);
-    decode_levels(store, number, layer, entries, |_, blocks| {
-        for (_, _, tally) in blocks {
-            real += u64::from(tally.real);
-            fictitious += u64::from(tally.fictitious);
+    let payloads = Payloads { store, number, layer, entries };
+    let forest = &layer.forest;
+    let chunks = Chunks::new(*forest, VERIFY_CHUNK_LOG2);
+    let add = |sum: (u64, u64), t: &Tally| (sum.0 + u64::from(t.real), sum.1 + u64::from(t.fictitious));
+    let (mut sum, mut coarse) = ((0, 0), HashMap::new());
+    for level in 0..chunks.level() {
+        let decoded = payloads.decode(forest.diamonds(level).collect::<Vec<_>>(), &coarse)?;
+        sum = decoded.iter().map(|(_, _, tally)| tally).fold(sum, add);
+        coarse = blocks(decoded);
+    }
+    let one = |corner: [u32; 2]| -> Result<(u64, u64), InspectError> {
+        let (mut sum, mut before) = ((0, 0), None);
+        for diamonds in chunks.needed(corner) {
+            let decoded = payloads.decode(diamonds, before.as_ref().unwrap_or(&coarse))?;
+            let owned = decoded.iter().filter(|(d, _, _)| chunks.owns(corner, *d));
+            sum = owned.map(|(_, _, tally)| tally).fold(sum, add);
+            before = Some(blocks(decoded));
         }
-    })?;
-    Ok((real, fictitious))
+        Ok(sum)
+    };
+    let rest = chunks.corners().into_par_iter().map(one);
+    rest.try_reduce(|| (0, 0), |a, b| Ok((a.0 + b.0, a.1 + b.1))).map(|rest| (sum.0 + rest.0, sum.1 + rest.1))
 }
 
-/// Decodes a layer level by level and shows each level's blocks to `visit`, coarse to fine.
-///
-/// Memory: two levels of blocks, about 24 bytes a sample of the finest.
+/// Decodes a layer level by level and shows each level's blocks to `visit`, coarse to fine. For scenes
+/// that fit in memory: two levels of blocks, up to 24 bytes a sample.
 ///
 /// # Errors
 /// When a payload is missing or damaged.
@@ -278,37 +339,12 @@ pub fn decode_levels(
     entries: &HashMap<Diamond, Entry>,
     mut visit: impl FnMut(u32, &[(Diamond, Block, Tally)]),
 ) -> Result<(), InspectError> {
-    let forest: &Forest = &layer.forest;
-    let mut before: HashMap<Diamond, Block> = HashMap::new();
-    for level in 0..forest.levels() {
-        let filled: Vec<Diamond> =
-            forest.diamonds(level).filter(|d| entries.get(d).is_some_and(|e| !e.is_empty())).collect();
-        let blocks: Vec<(Diamond, Block, Tally)> = filled
-            .into_par_iter()
-            .map(|d| {
-                let mut block = Block::empty(forest);
-                for parent in forest.parents(d) {
-                    if let Some(from) = before.get(&parent) {
-                        block.inherit(forest, d, parent, from);
-                    }
-                }
-                let [a, b] = d.centre();
-                let payload = store.get(Key { layer: number, kind: Kind::Points, a, b })?;
-                if payload.is_none() && entries.get(&d).is_some_and(|e| e.bytes > 0) {
-                    return Err(InspectError::NoPoints { layer: layer.name.clone(), centre: [a, b] });
-                }
-                let tally =
-                    points::decode(forest, &layer.coding, d, &mut block, &payload.unwrap_or_default())
-                        .map_err(|error| InspectError::Points {
-                            layer: layer.name.clone(),
-                            centre: [a, b],
-                            error,
-                        })?;
-                Ok((d, block, tally))
-            })
-            .collect::<Result<_, InspectError>>()?;
-        visit(level, &blocks);
-        before = blocks.into_iter().map(|(d, block, _)| (d, block)).collect();
+    let payloads = Payloads { store, number, layer, entries };
+    let mut before = HashMap::new();
+    for level in 0..layer.forest.levels() {
+        let decoded = payloads.decode(layer.forest.diamonds(level).collect::<Vec<_>>(), &before)?;
+        visit(level, &decoded);
+        before = blocks(decoded);
     }
     Ok(())
 }

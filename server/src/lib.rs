@@ -1,6 +1,7 @@
 //! Builds and serves streamed terrain.
 
 pub mod canvas;
+pub mod chunks;
 pub mod demo;
 pub mod height;
 pub mod hierarchy;

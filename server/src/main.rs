@@ -13,11 +13,6 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-/// A build frees and takes windows of megabytes all the time; the system's allocator hands each back to
-/// the kernel, and two thirds of the time went into page faults.
-#[global_allocator]
-static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
-
 /// Builds and serves streamed terrain.
 #[derive(Parser)]
 #[command(version, about, propagate_version = true)]

@@ -345,13 +345,11 @@ impl Drop for Writer {
     }
 }
 
+/// Where each blob went, and the bytes of each pack.
+type Packed = (Vec<(Key, Place)>, Vec<u64>);
+
 /// Copies the blobs, in order, into packs.
-fn lay_packs(
-    spool: &File,
-    spool_path: &Path,
-    blobs: &[Spooled],
-    data: &Path,
-) -> Result<(Vec<(Key, Place)>, Vec<u64>), StoreError> {
+fn lay_packs(spool: &File, spool_path: &Path, blobs: &[Spooled], data: &Path) -> Result<Packed, StoreError> {
     let mut entries = Vec::with_capacity(blobs.len());
     let mut pack_bytes = Vec::new();
     let mut buffer = Vec::new();
@@ -423,6 +421,10 @@ impl Manifest {
             None => return Err(damaged("no format number".to_owned())),
         }
         let manifest: Self = serde_json::from_value(value).map_err(|e| damaged(e.to_string()))?;
+        // The hash below is of values; what reads as the same values but was not written so is damage too.
+        if serde_json::to_vec_pretty(&manifest).ok().as_ref() != Some(&text) {
+            return Err(damaged("its text is not as it was written".to_owned()));
+        }
         if manifest.version() != manifest.scene.version {
             return Err(damaged(format!(
                 "says version {}, its content has {}",

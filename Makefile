@@ -1,0 +1,52 @@
+# Each target does its own set-up (scripts/setup says what it installs). Steps run one after another.
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.NOTPARALLEL:
+.PHONY: help demo test check bench setup fmt clippy tests doc deny wasm scripts
+
+step := scripts/step
+target := $(or $(CARGO_TARGET_DIR),target)
+
+help:
+	@echo "make demo    a sample scene built, served and drawn (HEADLESS=1: end after the picture)"
+	@echo "make test    everything that CI runs"
+	@echo "make check   formatting and lints only"
+	@echo "make bench   benchmarks, with a table at the end"
+
+demo:
+	@$(step) setup scripts/setup demo
+	@$(step) build cargo build --locked --release -p diamantina-server -p diamantina-client
+	$(target)/release/diamantina-server demo
+
+test: setup fmt clippy tests doc deny wasm scripts
+
+check: fmt clippy
+
+bench:
+	@$(step) setup scripts/setup demo
+	@scripts/bench
+
+setup:
+	@$(step) setup scripts/setup test
+
+fmt:
+	@$(step) fmt cargo fmt --all --check
+
+clippy:
+	@$(step) clippy cargo clippy --locked --workspace --all-targets -- -D warnings
+
+# With the output of tests that pass: it says which of them had no data to work on.
+tests:
+	@$(step) tests cargo test --locked --workspace --no-fail-fast -- --show-output
+
+doc:
+	@RUSTDOCFLAGS="-D warnings" $(step) doc cargo doc --locked --workspace --no-deps
+
+deny:
+	@$(step) deny scripts/deny check --hide-inclusion-graph bans licenses sources
+
+wasm:
+	@$(step) wasm scripts/wasm
+
+scripts:
+	@$(step) scripts shellcheck .ci/run scripts/bench scripts/deny scripts/setup scripts/step scripts/wasm

@@ -1,0 +1,25 @@
+//! End-to-end tests of Diamantina: one package, one binary.
+#![allow(
+    clippy::unwrap_used,
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    reason = "a test that cannot go on has failed, and its numbers are small"
+)]
+
+/// The same input gives the same bytes, whatever the threads and the memory.
+mod determinism;
+/// Wrong uses, broken files and sudden ends, through the real programs: exit codes, words, what survives.
+mod hostile;
+/// What the server answers to whom: routes, caches, refusals, heights.
+mod http;
+/// Law 2: any cut of a built store, with anything missing, has no cracks.
+mod seams;
+/// Streaming from end to end: pictures, bytes, flights with late data.
+mod stream;
+/// The house: who may import whom, how long a file may be.
+mod tidy;
+/// Law 3: declared errors hold at every sample of real DEMs.
+mod truth;
+/// The harness: synthetic DEM → store → server on a free port → client, and a network that misbehaves.
+mod world;
