@@ -1,12 +1,11 @@
 //! Pictures and flights without a window.
 
 use crate::camera::{Camera, FOV_Y};
-use crate::drawing::DrawItem;
 use crate::picture::{Picture, write_png};
 use crate::render::{self, FrameStats, Look, Offscreen, RenderError};
 use crate::terrain::{FrameView, Stats, Terrain, TerrainError};
 use diamantina_protocol::NODATA;
-use diamantina_protocol::diamond::Block;
+use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::message::{Layer, Scene};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -77,19 +76,21 @@ const FILLED: f64 = 0.95;
 /// The error, in pixels, at which what is drawn tells the outline of a scene.
 const OUTLINE_PIXELS: f64 = 12.0;
 
-/// A camera that sees a whole scene, from the south and above, as near as the box around it allows. Heights
-/// are multiplied by `exaggeration` to find it, but the camera itself is not.
+/// A camera that sees a whole scene, from the south and above, as near as the box around it allows.
 #[must_use]
-pub fn overview(scene: &Scene, size: [u32; 2], exaggeration: f64) -> Camera {
-    let [low, high] = extent(scene);
+pub fn overview(scene: &Scene, size: [u32; 2]) -> Camera {
+    around_box(extent(scene), size, 1.0)
+}
+
+fn around_box([low, high]: [DVec3; 2], size: [u32; 2], exaggeration: f64) -> Camera {
     let corner = |i: u32| DVec3::select(glam::BVec3::new(i & 1 > 0, i & 2 > 0, i & 4 > 0), high, low);
     around(&(0..8).map(corner).collect::<Vec<_>>(), size, exaggeration)
 }
 
 /// As [`overview`], but as near as the terrain itself allows, which may be less than its box: waits for a
-/// coarse form of it.
+/// coarse form of it. Heights are multiplied by `exaggeration` to find the camera, but its own are not.
 pub fn framed(terrain: &mut Terrain, size: [u32; 2], exaggeration: f64, patience: Duration) -> Camera {
-    let camera = overview(terrain.scene(), size, exaggeration);
+    let camera = around_box(extent(terrain.scene()), size, exaggeration);
     let wide = unstretched(&stretched(&camera, exaggeration), exaggeration);
     let until = Instant::now() + patience;
     let view = loop {
@@ -100,15 +101,16 @@ pub fn framed(terrain: &mut Terrain, size: [u32; 2], exaggeration: f64, patience
         std::thread::sleep(Duration::from_millis(2));
     };
     let layers = &terrain.scene().layers;
-    let points: Vec<DVec3> =
-        view.items.iter().flat_map(|item| points_of(&layers[item.layer], item)).collect();
+    let mut points = Vec::new();
+    for item in &view.items {
+        points.extend(points_of(&layers[item.layer], item.diamond, item.surface.block()));
+    }
     if points.is_empty() { camera } else { around(&points, size, exaggeration) }
 }
 
 /// All points of a diamond that have a height.
-fn points_of(layer: &Layer, item: &DrawItem) -> impl Iterator<Item = DVec3> {
-    let (local, block) = (layer.forest.local(item.diamond), item.surface.block());
-    let n = block.segments();
+fn points_of(layer: &Layer, diamond: Diamond, block: &Block) -> impl Iterator<Item = DVec3> {
+    let (local, n) = (layer.forest.local(diamond), block.segments());
     let places = (0..=2 * n).flat_map(move |q| (q % 2..=2 * n).step_by(2).map(move |p| (p, q)));
     places.filter(move |(p, q)| local.upper || q <= p).filter_map(move |(p, q)| {
         let height = block.heights()[Block::slot(n, p, q)];
@@ -396,7 +398,7 @@ impl FlightPath {
         let [low, high] = extent(scene);
         let centre = (low + high) / 2.0;
         let span = high - low;
-        let far = overview(scene, [16, 9], 1.0);
+        let far = overview(scene, [16, 9]);
         let keys = (0..=12).map(|i| {
             let part = f64::from(i) / 12.0;
             let angle = part * std::f64::consts::TAU - std::f64::consts::FRAC_PI_2;
@@ -638,7 +640,7 @@ mod tests {
         ];
         for size in [[1380, 768], [400, 900]] {
             for bounds in boxes {
-                let camera = around(&corners(bounds), size, 1.0);
+                let camera = around_box(bounds, size, 1.0);
                 let seen = corners(bounds).map(|p| seen(&camera, p));
                 assert!(seen.iter().all(|s| s[2] > 0.0), "{camera:?}");
                 let most = |i: usize| seen.iter().map(|s| s[i].abs()).fold(0.0, f64::max);
@@ -663,7 +665,7 @@ mod tests {
             (state >> 33) as f64 / f64::from(1u32 << 31)
         };
         for _ in 0..2000 {
-            let exaggeration = [0.3, 2.0, 5.0, 20.0][(dice() * 4.0) as usize];
+            let exaggeration = *[0.3, 2.0, 5.0, 20.0].iter().find(|_| dice() < 0.3).unwrap_or(&1.0);
             let mut point = |z: f64| DVec3::new(dice() * 1e4, dice() * 1e4, dice() * z);
             let camera = Camera { eye: point(2e4), target: point(1e3), fov_y: FOV_Y, size: [1380, 768] };
             let p = point(1e3 * exaggeration);
@@ -678,7 +680,7 @@ mod tests {
             // An error of a metre, stretched, at its own distance.
             let (near, far) = ((flat - wide.eye).length(), (p - camera.eye).length());
             let bound = wide.error_pixels(1.0, near) * exaggeration.max(1.0);
-            assert!(camera.error_pixels(exaggeration as f32, far) <= bound * (1.0 + 1e-6));
+            assert!(camera.error_pixels(1.0, far) * exaggeration <= bound * (1.0 + 1e-6));
         }
     }
 

@@ -164,6 +164,7 @@ fn parse_background(text: &str) -> Result<Background, String> {
     let colour = (digits.len() == 6).then(|| u32::from_str_radix(digits, 16).ok()).flatten();
     let colour = colour.ok_or("expected sky or six hexadecimal digits, as in ff00ff")?;
     // The picture is sRGB, blending is linear.
+    #[allow(clippy::cast_possible_truncation, reason = "a colour needs no more than f32")]
     let linear = |shift: u32| {
         let c = f64::from(colour >> shift & 0xff) / 255.0;
         (if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }) as f32

@@ -1,6 +1,13 @@
 //! A made landscape: mountains with branching valleys, and a drowned coast where the data end. The same on
 //! every machine, since it uses only hashing, addition, multiplication, division and square roots.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    reason = "cells of noise, a few thousand a side, and heights of some kilometres"
+)]
+
 mod erosion;
 
 use erosion::{Lattice, Plan};

@@ -30,6 +30,7 @@ mod usgs_dem;
 use std::fmt;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom, Write};
+use std::num::NonZeroU32;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -63,7 +64,7 @@ pub struct Options {
     pub crs: CrsChoice,
     /// CRS of the sources that do not say theirs, such as EPSG:4326 for degrees
     #[arg(long, value_name = "EPSG:N", value_parser = parse_epsg)]
-    pub assume_crs: Option<u32>,
+    pub assume_crs: Option<NonZeroU32>,
     /// Metres between samples, when reprojecting or for a source that does not say (PNG, raw, degrees
     /// without a CRS)
     #[arg(long, value_name = "METRES")]
@@ -83,7 +84,7 @@ pub struct Options {
 }
 
 /// The number in `EPSG:N`.
-fn parse_epsg(text: &str) -> std::result::Result<u32, String> {
+fn parse_epsg(text: &str) -> std::result::Result<NonZeroU32, String> {
     let code = text.to_ascii_lowercase().strip_prefix("epsg:").and_then(|n| n.parse().ok());
     code.ok_or_else(|| format!("expected EPSG:N, such as EPSG:4326, found '{text}'"))
 }
@@ -410,7 +411,7 @@ fn assume_crs(raster: &mut Raster, options: &Options) -> Result<()> {
         ));
     };
     if place.crs.is_none() {
-        let crs = SourceCrs::epsg(code, false);
+        let crs = SourceCrs::epsg(code.get(), false);
         if crs.proj4.is_none() {
             return Err(bad_options(
                 &raster.file,

@@ -46,7 +46,7 @@ fn the_command_line_says_it_all() {
     assert_eq!((options.crs, options.nodata), (CrsChoice::Epsg(32632), Some(-9999.0)));
     assert_eq!(options.raw, Some(RawShape { width: 7, height: 9, dtype: Dtype::I16 }));
     assert_eq!(parse("x").unwrap().crs, CrsChoice::Auto);
-    assert_eq!(parse("x --assume-crs epsg:4326").unwrap().assume_crs, Some(4326));
+    assert_eq!(parse("x --assume-crs epsg:4326").unwrap().assume_crs, NonZeroU32::new(4326));
     for wrong in [
         "x --crs utm",
         "x --crs EPSG:-1",
@@ -465,7 +465,7 @@ fn degrees_without_a_crs_are_refused_or_assumed() {
         let words = ["plain.tif", "look like degrees", "--assume-crs EPSG:4326", "--cell METRES"];
         assert!(words.iter().all(|w| message.contains(w)), "{message}");
     }
-    let assumed = Options { assume_crs: Some(4326), ..Options::default() };
+    let assumed = Options { assume_crs: NonZeroU32::new(4326), ..Options::default() };
     let grid = open(&degrees, &assumed).unwrap().grid().clone();
     assert_eq!(grid.crs.unwrap().name, "EPSG:32605");
     assert!((grid.cell[0] - 10.8).abs() < 0.2, "{:?}", grid.cell);
@@ -480,7 +480,7 @@ fn degrees_without_a_crs_are_refused_or_assumed() {
     let known = tiff!(colortype::GrayI16, 20, 20, [7i16; 400], &Tags::utm());
     let known = [put(&folder, "known.tif", &known)];
     assert_eq!(open(&known, &assumed).unwrap().grid().crs.as_ref().unwrap().name, "EPSG:32632");
-    let unknown = Options { assume_crs: Some(1), ..Options::default() };
+    let unknown = Options { assume_crs: NonZeroU32::new(1), ..Options::default() };
     assert!(open(&degrees, &unknown).unwrap_err().to_string().contains("known EPSG code"));
 }
 
@@ -803,7 +803,7 @@ fn every_real_dem_is_as_its_manifest_says() {
         }
         let cell = file.ends_with(".png").then_some(1.0);
         // Degrees, though the file does not say so.
-        let assume_crs = file.contains("hilo").then_some(4326);
+        let assume_crs = file.contains("hilo").then(|| NonZeroU32::new(4326)).flatten();
         let source = open(&[folder.join(file)], &Options { cell, assume_crs, ..source_crs() });
         let source = source.unwrap_or_else(|e| panic!("{e}"));
         let grid = source.grid();

@@ -6,6 +6,13 @@
 //! than scree. Lattices from coarse to fine share the work: the coarse ones find the great valleys in many
 //! cheap steps, the fine ones add their branches in few.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    reason = "numbers of nodes of a lattice of a thousand a side"
+)]
+
 use super::{hash, noise};
 use rayon::prelude::*;
 use std::cmp::Reverse;
