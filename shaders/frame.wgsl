@@ -28,7 +28,7 @@ struct Layer {
     cell: vec2<f32>,
     // Metres from the eye to the reference point of the lattice, a point near the eye.
     offset: vec2<f32>,
-    // Metres of a quantum.
+    // Metres of a quantum, stretched.
     quantum: f32,
     // Metres from the eye up to the reference height, a height near the eye's.
     up_offset: f32,
@@ -36,10 +36,12 @@ struct Layer {
     height: i32,
     // 1 / depth of the deepest point, in metres; 0 where the layer has no sea.
     per_depth: f32,
-    // The lowest height of land, in metres, and 1 / its range.
+    // The lowest height of land, in metres, and parts of the ramp for a metre above it.
     land_base: f32,
     per_height: f32,
-    unused: vec2<f32>,
+    // What heights are multiplied by.
+    exaggeration: f32,
+    unused: f32,
 }
 
 @group(0) @binding(0) var<uniform> frame: Frame;
@@ -61,9 +63,11 @@ fn haze_to(up: f32, distance: f32) -> f32 {
     return 1.0 - exp(-frame.horizon.w * density * distance);
 }
 
-// The light that a surface sends back: the sun, and the sky's half sphere, brighter from above.
+// The light that a surface sends back: the sun, and the sky's half sphere, brighter from above. The sun
+// fades out softly, as it does on rough ground: a sharp edge of light would follow the mesh.
 fn lit(albedo: vec3<f32>, normal: vec3<f32>) -> vec3<f32> {
-    let sun = vec3<f32>(1.08, 1.04, 0.97) * max(dot(normal, frame.sun.xyz), 0.0);
+    let towards = dot(normal, frame.sun.xyz);
+    let sun = vec3<f32>(1.08, 1.04, 0.97) * (0.5 * (towards + sqrt(towards * towards + 0.02)));
     let sky = vec3<f32>(0.25, 0.28, 0.34) * (0.5 + 0.5 * normal.z);
     return albedo * (sun + sky);
 }

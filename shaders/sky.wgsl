@@ -19,5 +19,5 @@ fn sky_fragment(ray: Ray) -> @location(0) vec4<f32> {
     let up = normalize(ray.direction).z;
     let above = mix(frame.horizon.rgb, frame.zenith.rgb, 1.0 - exp(-4.0 * max(up, 0.0)));
     // Below the horizon there is haze, darker further down.
-    return encoded(above * mix(1.0, 0.55, smoothstep(0.0, 0.6, -up)));
+    return encoded(above * mix(1.0, 0.74, smoothstep(0.0, 0.7, -up)));
 }

@@ -81,8 +81,9 @@ fn level_tint(level: f32) -> vec3<f32> {
 @fragment
 fn terrain_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
     let across = shaded.about.xy;
-    let normal = vec3<f32>(across, sqrt(max(1.0 - dot(across, across), 0.0)));
-    let height = frame.sun.w + shaded.about.z;
+    let up = sqrt(max(1.0 - dot(across, across), 0.0));
+    let normal = normalize(vec3<f32>(across * layer.exaggeration, up));
+    let height = (frame.sun.w + shaded.about.z) / layer.exaggeration;
     var albedo = albedo_at(height, max(fwidth(height), 1e-6), normal.z);
     if frame.options.y != 0.0 {
         albedo = mix(albedo, level_tint(round(shaded.level)), 0.5);

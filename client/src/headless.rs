@@ -4,7 +4,9 @@ use crate::camera::{Camera, FOV_Y};
 use crate::picture::{Picture, write_png};
 use crate::render::{self, FrameStats, Look, Offscreen, RenderError};
 use crate::terrain::{FrameView, Stats, Terrain, TerrainError};
-use diamantina_protocol::message::Scene;
+use diamantina_protocol::NODATA;
+use diamantina_protocol::diamond::{Block, Diamond};
+use diamantina_protocol::message::{Layer, Scene};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use std::fs::File;
@@ -64,19 +66,166 @@ pub fn extent(scene: &Scene) -> [DVec3; 2] {
     boxes.reduce(|[a, b], [c, d]| [a.min(c), b.max(d)]).unwrap_or([DVec3::ZERO, DVec3::ONE])
 }
 
-/// A camera that sees a whole scene, from the south and above.
+/// Degrees below the horizon that an overview may look down: as flat as mountains look best, and as steep
+/// as maps.
+const TILTS: [u32; 2] = [30, 54];
+
+/// The part of the picture's width or height that an overview fills.
+const FILLED: f64 = 0.95;
+
+/// The error, in pixels, at which what is drawn tells the outline of a scene.
+const OUTLINE_PIXELS: f64 = 12.0;
+
+/// A camera that sees a whole scene, from the south and above, as near as the box around it allows.
 #[must_use]
 pub fn overview(scene: &Scene, size: [u32; 2]) -> Camera {
-    let [low, high] = extent(scene);
-    let centre = (low + high) / 2.0;
-    let radius = (high - low).truncate().length() / 2.0;
-    let aspect = f64::from(size[0].max(1)) / f64::from(size[1].max(1));
-    // Far enough that the ground's circle fits the narrower side of the view.
-    let narrow = ((FOV_Y / 2.0).tan() * aspect.min(1.35)).atan();
-    let distance = radius / narrow.sin() * 0.86;
-    let tilt = 38f64.to_radians();
-    let eye = centre + DVec3::new(0.0, -tilt.cos(), tilt.sin()) * distance;
-    Camera { eye, target: centre, fov_y: FOV_Y, size }
+    around_box(extent(scene), size, 1.0)
+}
+
+fn around_box([low, high]: [DVec3; 2], size: [u32; 2], exaggeration: f64) -> Camera {
+    let corner = |i: u32| DVec3::select(glam::BVec3::new(i & 1 > 0, i & 2 > 0, i & 4 > 0), high, low);
+    around(&(0..8).map(corner).collect::<Vec<_>>(), size, exaggeration)
+}
+
+/// As [`overview`], but as near as the terrain itself allows, which may be less than its box: waits for a
+/// coarse form of it. Heights are multiplied by `exaggeration` to find the camera, but its own are not.
+pub fn framed(terrain: &mut Terrain, size: [u32; 2], exaggeration: f64, patience: Duration) -> Camera {
+    let camera = around_box(extent(terrain.scene()), size, exaggeration);
+    let wide = unstretched(&stretched(&camera, exaggeration), exaggeration);
+    let until = Instant::now() + patience;
+    let view = loop {
+        let view = terrain.frame(&wide);
+        if view.complete || view.error_pixels <= OUTLINE_PIXELS || Instant::now() >= until {
+            break view;
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    };
+    let layers = &terrain.scene().layers;
+    let mut points = Vec::new();
+    for item in &view.items {
+        points.extend(points_of(&layers[item.layer], item.diamond, item.surface.block()));
+    }
+    if points.is_empty() { camera } else { around(&points, size, exaggeration) }
+}
+
+/// All points of a diamond that have a height.
+fn points_of(layer: &Layer, diamond: Diamond, block: &Block) -> impl Iterator<Item = DVec3> {
+    let (local, n) = (layer.forest.local(diamond), block.segments());
+    let places = (0..=2 * n).flat_map(move |q| (q % 2..=2 * n).step_by(2).map(move |p| (p, q)));
+    places.filter(move |(p, q)| local.upper || q <= p).filter_map(move |(p, q)| {
+        let height = block.heights()[Block::slot(n, p, q)];
+        let (p, q) = (p as f64 / 2.0, q as f64 / 2.0);
+        let along = |i: usize| {
+            let steps = local.origin[i] as f64 + local.u[i] as f64 * p + local.v[i] as f64 * q;
+            layer.origin[i] + layer.cell[i] * steps
+        };
+        (height != NODATA).then(|| DVec3::new(along(0), along(1), layer.metres(height)))
+    })
+}
+
+/// The camera from the south and above that holds all points as large as can be. Of the tilts, it takes the
+/// one at which they fill the picture best.
+fn around(points: &[DVec3], size: [u32; 2], exaggeration: f64) -> Camera {
+    let points: Vec<DVec3> = points.iter().map(|p| p.with_z(p.z * exaggeration)).collect();
+    let low = points.iter().copied().fold(DVec3::INFINITY, DVec3::min);
+    let high = points.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max);
+    let filled = |camera: &Camera| {
+        // The ground's trapezium, in parts of the picture.
+        let [right, up, backward] = camera.axes();
+        let corners = [[low.x, low.y], [high.x, low.y], [high.x, high.y], [low.x, high.y]].map(|[x, y]| {
+            let p = DVec3::new(x, y, f64::midpoint(low.z, high.z)) - camera.eye;
+            glam::DVec2::new(p.dot(right), p.dot(up)) / p.dot(-backward)
+        });
+        (corners[2] - corners[0]).perp_dot(corners[3] - corners[1])
+    };
+    let cameras = (TILTS[0]..=TILTS[1]).step_by(3).map(|tilt| fit(&points, tilt, size));
+    let best = cameras.max_by(|a, b| filled(a).total_cmp(&filled(b)));
+    let best = best.unwrap_or_else(|| fit(&points, TILTS[0], size));
+    let flat = |p: DVec3| p.with_z(p.z / exaggeration);
+    Camera { eye: flat(best.eye), target: flat(best.target), ..best }
+}
+
+/// The camera that looks down by `tilt` degrees and holds all points as large as can be.
+fn fit(points: &[DVec3], tilt: u32, size: [u32; 2]) -> Camera {
+    let tilt = f64::from(tilt).to_radians();
+    let backward = DVec3::new(0.0, -tilt.cos(), tilt.sin());
+    let axes = Camera { eye: backward, target: DVec3::ZERO, fov_y: FOV_Y, size }.axes();
+    let tan_y = (FOV_Y / 2.0).tan();
+    let tan_x = tan_y * f64::from(size[0].max(1)) / f64::from(size[1].max(1));
+    // Relative to one of the points, for precision.
+    let base = points.first().copied().unwrap_or_default();
+    // Of an eye at (x, y, back) along the axes, the point at (px, py, pback) is seen if
+    // |px - x| <= tan_x (back - pback), and so for y: four linear bounds.
+    let side = |axis: DVec3, tan: f64| {
+        let bound = |p: &DVec3| (*p - base).dot(axis) + tan * (*p - base).dot(axes[2]);
+        points.iter().map(bound).fold(f64::NEG_INFINITY, f64::max)
+    };
+    let (tan_x, tan_y) = (tan_x * FILLED, tan_y * FILLED);
+    let [east, west] = [axes[0], -axes[0]].map(|axis| side(axis, tan_x));
+    let [top, bottom] = [axes[1], -axes[1]].map(|axis| side(axis, tan_y));
+    let back = ((east + west) / (2.0 * tan_x)).max((top + bottom) / (2.0 * tan_y));
+    let [x, y] = [(east - west) / 2.0, (top - bottom) / 2.0];
+    let eye = base + axes[0] * x + axes[1] * y + axes[2] * back;
+    // Half way into the scene.
+    let depth = |p: &DVec3| (eye - *p).dot(axes[2]);
+    let nearest = points.iter().map(depth).fold(f64::INFINITY, f64::min);
+    let farthest = points.iter().map(depth).fold(0.0, f64::max);
+    // A single point has no size to look at.
+    let ahead = f64::midpoint(nearest, farthest).max(1e-3);
+    Camera {
+        eye: eye + backward * if back > 0.0 { 0.0 } else { 1.0 },
+        target: eye - backward * ahead,
+        fov_y: FOV_Y,
+        size,
+    }
+}
+
+/// The camera of a picture whose heights are multiplied: its own heights are, too.
+fn stretched(camera: &Camera, exaggeration: f64) -> Camera {
+    let stretch = |p: DVec3| p.with_z(p.z * exaggeration);
+    Camera { eye: stretch(camera.eye), target: stretch(camera.target), ..*camera }
+}
+
+/// A camera that sees, of the terrain as it is, at least what `camera` sees of the stretched one, and sees a
+/// metre as large at each distance. Distances only shrink on the way (or, where exaggeration is below 1, by
+/// no more than heights do), so a cut whose error is E pixels in this view has at most E times the larger of
+/// exaggeration and 1 in the stretched one.
+fn unstretched(camera: &Camera, exaggeration: f64) -> Camera {
+    let flat = |p: DVec3| p.with_z(p.z / exaggeration);
+    let eye = flat(camera.eye);
+    #[allow(clippy::float_cmp, reason = "1 is what no option leaves")]
+    if exaggeration == 1.0 {
+        return *camera;
+    }
+    let [right, up, backward] = camera.axes();
+    let half = camera.size.map(|s| f64::from(s) / 2.0 / camera.pixels_per_radian());
+    let corners = [[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]];
+    let corners =
+        corners.map(|[x, y]| flat(right * (x * half[0]) + up * (y * half[1]) - backward).normalize());
+    // Half way between the upper and the lower side, so that no corner is a right angle away.
+    let [lower, upper] = [corners[0] + corners[1], corners[2] + corners[3]].map(DVec3::normalize);
+    let view = Camera { eye, target: eye + (lower + upper).normalize(), ..*camera };
+    let [right, up, backward] = view.axes();
+    let size = [right, up].map(|axis| {
+        let tan = |c: &DVec3| c.dot(axis).abs() / c.dot(-backward).max(1e-6);
+        let most = corners.iter().map(tan).fold(0.0, f64::max);
+        #[allow(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a float to integer cast saturates"
+        )]
+        let pixels = (2.0 * most * camera.pixels_per_radian()).ceil() as u32;
+        pixels.max(1)
+    });
+    let fov_y = 2.0 * (f64::from(size[1]) / 2.0 / camera.pixels_per_radian()).atan();
+    Camera { fov_y, size, ..view }
+}
+
+/// The tolerance to stream with, in pixels, so that heights multiplied by `exaggeration` are drawn with one
+/// of `pixels`.
+#[must_use]
+pub fn tolerance(pixels: f64, exaggeration: f64) -> f64 {
+    pixels / exaggeration.max(1.0)
 }
 
 /// Numbers about a picture.
@@ -114,6 +263,8 @@ pub struct PictureReport {
     pub seconds_to_first_picture: Option<f64>,
     /// Seconds until the asked error was reached.
     pub seconds_to_asked_error: Option<f64>,
+    /// What heights were multiplied by.
+    pub exaggeration: f64,
     /// The asked error, in pixels.
     pub asked_error_pixels: f64,
     /// The largest error of what is drawn, in pixels, from the declared errors.
@@ -125,7 +276,7 @@ pub struct PictureReport {
 }
 
 /// Streams until the camera's view is as exact as asked, and draws it. Gives up waiting after `patience`
-/// and draws what is there.
+/// and draws what is there. Where the look stretches heights, the camera's are stretched, too.
 ///
 /// # Errors
 /// When there is no graphics adapter.
@@ -137,27 +288,30 @@ pub fn picture(
     patience: Duration,
 ) -> Result<(Picture, PictureReport), HeadlessError> {
     let mut offscreen = Offscreen::new(options)?;
-    let view = terrain.settle(camera, patience);
+    let drawn = stretched(camera, look.exaggeration);
+    let view = terrain.settle(&unstretched(&drawn, look.exaggeration), patience);
     let layers = &terrain.scene().layers;
-    offscreen.draw(layers, camera, &view.items, look)?;
+    offscreen.draw(layers, &drawn, &view.items, look)?;
     offscreen.read()?;
     // Everything is uploaded by now: this is what a frame costs.
     let started = Instant::now();
-    let frame = offscreen.draw(layers, camera, &view.items, look)?;
+    let frame = offscreen.draw(layers, &drawn, &view.items, look)?;
     let picture = offscreen.read()?;
     let milliseconds_a_frame = started.elapsed().as_secs_f64() * 1e3;
-    let report = report(terrain, camera, &view, frame, milliseconds_a_frame);
+    let report = report(terrain, camera, look, &view, frame, milliseconds_a_frame);
     Ok((picture, report))
 }
 
 fn report(
     terrain: &Terrain,
     camera: &Camera,
+    look: &Look,
     view: &FrameView,
     frame: FrameStats,
     milliseconds_a_frame: f64,
 ) -> PictureReport {
     let Stats { traffic, .. } = view.stats;
+    let larger = look.exaggeration.max(1.0);
     PictureReport {
         scene: terrain.scene().name.clone(),
         version: terrain.scene().version.clone(),
@@ -175,8 +329,9 @@ fn report(
         draws: frame.draws,
         seconds_to_first_picture: view.stats.first_picture_seconds,
         seconds_to_asked_error: view.stats.asked_error_seconds,
-        asked_error_pixels: terrain.tolerance_pixels(),
-        largest_error_pixels: view.error_pixels,
+        exaggeration: look.exaggeration,
+        asked_error_pixels: terrain.tolerance_pixels() * larger,
+        largest_error_pixels: view.error_pixels * larger,
         complete: view.complete,
         milliseconds_a_frame,
     }
@@ -405,10 +560,11 @@ pub fn fly(
         }
         let camera = path.camera(f64::from(frame) / f64::from((flight.frames - 1).max(1)), flight.size);
         let clock = Instant::now();
-        let view = terrain.frame(&camera);
+        let drawn = stretched(&camera, look.exaggeration);
+        let view = terrain.frame(&unstretched(&drawn, look.exaggeration));
         let cut_ms = clock.elapsed().as_secs_f64() * 1e3;
         let clock = Instant::now();
-        let stats = offscreen.draw(&layers, &camera, &view.items, look)?;
+        let stats = offscreen.draw(&layers, &drawn, &view.items, look)?;
         let picture = offscreen.read()?;
         let draw_ms = clock.elapsed().as_secs_f64() * 1e3;
         let line = FrameLine {
@@ -416,8 +572,8 @@ pub fn fly(
             seconds: started.elapsed().as_secs_f64(),
             cut_ms,
             draw_ms,
-            error_pixels: view.error_pixels,
-            goal_pixels: view.error_pixels_goal,
+            error_pixels: view.error_pixels * look.exaggeration.max(1.0),
+            goal_pixels: view.error_pixels_goal * look.exaggeration.max(1.0),
             complete: view.complete,
             diamonds: view.items.len(),
             triangles: stats.triangles,
@@ -458,6 +614,74 @@ mod tests {
 
     fn key(seconds: f64, x: f64) -> PathKey {
         PathKey { seconds, eye: [x, 0.0, 100.0], target: [x, 500.0, 0.0] }
+    }
+
+    /// Clip coordinates of a point, with 1 at the picture's sides.
+    fn seen(camera: &Camera, p: DVec3) -> [f64; 3] {
+        let [right, up, backward] = camera.axes();
+        let (tan, from) = ((camera.fov_y / 2.0).tan(), p - camera.eye);
+        let depth = -from.dot(backward);
+        let aspect = f64::from(camera.size[0]) / f64::from(camera.size[1]);
+        [from.dot(right) / depth / tan / aspect, from.dot(up) / depth / tan, depth]
+    }
+
+    fn corners([low, high]: [DVec3; 2]) -> [DVec3; 8] {
+        std::array::from_fn(|i| DVec3::select(glam::BVec3::new(i & 1 > 0, i & 2 > 0, i & 4 > 0), high, low))
+    }
+
+    #[test]
+    fn an_overview_holds_the_box_tightly() {
+        let boxes = [
+            [DVec3::new(5e5, 4e6, 0.0), DVec3::new(5.6e5, 4.06e6, 3500.0)],
+            [DVec3::new(0.0, 0.0, -0.135), DVec3::new(5.5, 3.4, 0.125)],
+            [DVec3::new(-1e6, 2e6, -4800.0), DVec3::new(-3e4, 2.97e6, 5900.0)],
+            [DVec3::new(4e5, 4e6, 100.0), DVec3::new(4.1e5, 4.09e6, 900.0)],
+            [DVec3::new(4e5, 4e6, 100.0), DVec3::new(4.9e5, 4.01e6, 900.0)],
+        ];
+        for size in [[1380, 768], [400, 900]] {
+            for bounds in boxes {
+                let camera = around_box(bounds, size, 1.0);
+                let seen = corners(bounds).map(|p| seen(&camera, p));
+                assert!(seen.iter().all(|s| s[2] > 0.0), "{camera:?}");
+                let most = |i: usize| seen.iter().map(|s| s[i].abs()).fold(0.0, f64::max);
+                let widest = most(0).max(most(1));
+                assert!((widest - FILLED).abs() < 1e-6, "{widest} {camera:?}");
+                assert!(camera.eye.y < bounds[0].y && camera.eye.z > bounds[1].z, "from the south and above");
+            }
+        }
+    }
+
+    #[test]
+    fn a_lone_point_has_an_overview() {
+        let camera = around(&[DVec3::new(5e5, 4e6, 100.0)], [4, 3], 1.0);
+        assert!(camera.eye.is_finite() && camera.eye != camera.target, "{camera:?}");
+    }
+
+    #[test]
+    fn an_unstretched_view_holds_what_the_stretched_one_shows() {
+        let mut state = 1u64;
+        let mut dice = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 33) as f64 / f64::from(1u32 << 31)
+        };
+        for _ in 0..2000 {
+            let exaggeration = *[0.3, 2.0, 5.0, 20.0].iter().find(|_| dice() < 0.3).unwrap_or(&1.0);
+            let mut point = |z: f64| DVec3::new(dice() * 1e4, dice() * 1e4, dice() * z);
+            let camera = Camera { eye: point(2e4), target: point(1e3), fov_y: FOV_Y, size: [1380, 768] };
+            let p = point(1e3 * exaggeration);
+            let wide = unstretched(&camera, exaggeration);
+            assert!((wide.pixels_per_radian() / camera.pixels_per_radian() - 1.0).abs() < 1e-9);
+            let flat = p.with_z(p.z / exaggeration);
+            let [x, y, depth] = seen(&camera, p);
+            if depth > 0.0 && x.abs() < 1.0 && y.abs() < 1.0 {
+                let [x, y, depth] = seen(&wide, flat);
+                assert!(depth > 0.0 && x.abs() < 1.0 + 1e-6 && y.abs() < 1.0 + 1e-6, "{camera:?} {wide:?}");
+            }
+            // An error of a metre, stretched, at its own distance.
+            let (near, far) = ((flat - wide.eye).length(), (p - camera.eye).length());
+            let bound = wide.error_pixels(1.0, near) * exaggeration.max(1.0);
+            assert!(camera.error_pixels(1.0, far) * exaggeration <= bound * (1.0 + 1e-6));
+        }
     }
 
     #[test]

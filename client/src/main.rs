@@ -5,11 +5,16 @@ use diamantina_client::camera::{Camera, FOV_Y};
 use diamantina_client::headless::{self, Flight, FlightPath, FrameLine, PictureReport};
 use diamantina_client::render::{self, Background, Colours, Look, Sun};
 use diamantina_client::terrain::{self, Terrain};
+use diamantina_protocol::message::Scene;
 use glam::DVec3;
 use std::io::Write;
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
+
+/// What heights may be multiplied by.
+const EXAGGERATION: RangeInclusive<f64> = 0.01..=1000.0;
 
 /// Draws streamed terrain.
 #[derive(Parser)]
@@ -43,18 +48,36 @@ struct ViewArgs {
     /// Memory for decoded diamonds
     #[arg(long, default_value = "1024", value_name = "MIB")]
     memory: usize,
-    /// Where the sun stands: degrees clockwise from north, degrees above the horizon
-    #[arg(long, default_value = "315,45", value_name = "AZIMUTH,ALTITUDE", value_parser = parse_pair)]
-    sun: [f64; 2],
-    /// What is behind the terrain: sky, or a colour as six hexadecimal digits
-    #[arg(long, default_value = "sky", value_name = "sky|RRGGBB", value_parser = parse_background)]
-    background: Background,
+    /// Where the sun stands: degrees clockwise from north, degrees above the horizon [default: 315,45; 315,20
+    /// on other bodies than the Earth]
+    #[arg(long, value_name = "AZIMUTH,ALTITUDE", value_parser = parse_pair)]
+    sun: Option<[f64; 2]>,
+    /// What is behind the terrain: sky, or a colour as six hexadecimal digits [default: sky; black on other
+    /// bodies than the Earth]
+    #[arg(long, value_name = "sky|RRGGBB", value_parser = parse_background)]
+    background: Option<Background>,
+    /// What colours mean: terrain is coloured by height, bathymetry also by depth below 0 m; auto is grey on
+    /// other bodies than the Earth, and bathymetry where a tenth of the range of heights lies below 0 m
+    #[arg(long, default_value = "auto", value_enum)]
+    colours: ColourName,
+    /// What heights are multiplied by, to make gentle relief visible; errors and the heights of eye and
+    /// target are multiplied, too
+    #[arg(long, default_value_t = 1.0, value_name = "N")]
+    exaggeration: f64,
     /// Tint diamonds by their level
     #[arg(long)]
     show_levels: bool,
     /// One sample a pixel: faster, with jagged edges
     #[arg(long)]
     no_antialias: bool,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum ColourName {
+    Auto,
+    Terrain,
+    Bathymetry,
+    Grey,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -141,6 +164,7 @@ fn parse_background(text: &str) -> Result<Background, String> {
     let colour = (digits.len() == 6).then(|| u32::from_str_radix(digits, 16).ok()).flatten();
     let colour = colour.ok_or("expected sky or six hexadecimal digits, as in ff00ff")?;
     // The picture is sRGB, blending is linear.
+    #[allow(clippy::cast_possible_truncation, reason = "a colour needs no more than f32")]
     let linear = |shift: u32| {
         let c = f64::from(colour >> shift & 0xff) / 255.0;
         (if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }) as f32
@@ -183,11 +207,18 @@ impl ViewArgs {
                 format!("--error-pixels {}: expected a number above 0", self.error_pixels),
             ));
         }
+        if !EXAGGERATION.contains(&self.exaggeration) {
+            let [low, high] = [EXAGGERATION.start(), EXAGGERATION.end()];
+            return Err(Failure(
+                2,
+                format!("--exaggeration {}: expected a number from {low} to {high}", self.exaggeration),
+            ));
+        }
         let encoding = match self.encoding {
             Encoding::Points => terrain::ENCODING.to_owned(),
         };
         let options = terrain::Options {
-            tolerance_pixels: self.error_pixels,
+            tolerance_pixels: headless::tolerance(self.error_pixels, self.exaggeration),
             memory_bytes: self.memory << 20,
             encoding,
             ..terrain::Options::default()
@@ -195,14 +226,23 @@ impl ViewArgs {
         Ok(Terrain::open(&self.url, options)?)
     }
 
-    fn look(&self) -> Look {
-        let sun = Sun { azimuth_degrees: self.sun[0], altitude_degrees: self.sun[1] };
+    fn look(&self, scene: &Scene) -> Look {
+        let look = Look::of(scene);
         Look {
-            background: self.background,
-            sun,
-            colours: Colours::Hypsometric,
+            background: self.background.unwrap_or(look.background),
+            sun: self.sun.map_or(look.sun, |[azimuth_degrees, altitude_degrees]| Sun {
+                azimuth_degrees,
+                altitude_degrees,
+            }),
+            colours: match self.colours {
+                ColourName::Auto => look.colours,
+                ColourName::Terrain => Colours::Terrain,
+                ColourName::Bathymetry => Colours::Bathymetry,
+                ColourName::Grey => Colours::Grey,
+            },
+            exaggeration: self.exaggeration,
             show_levels: self.show_levels,
-            ..Look::default()
+            ..look
         }
     }
 
@@ -223,10 +263,10 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
             ));
         }
         (Some(eye), Some(target)) => Camera { eye, target, fov_y: FOV_Y, size: args.view.size },
-        _ => headless::overview(terrain.scene(), args.view.size),
+        _ => headless::framed(&mut terrain, args.view.size, args.view.exaggeration, patience),
     };
-    let (picture, report) =
-        headless::picture(&mut terrain, &camera, &args.view.look(), &args.view.options(), patience)?;
+    let look = args.view.look(terrain.scene());
+    let (picture, report) = headless::picture(&mut terrain, &camera, &look, &args.view.options(), patience)?;
     headless::save(&picture, &args.output)?;
     if let Some(path) = &args.json {
         let mut out = headless::open_text(path)?;
@@ -295,7 +335,8 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
     let (mut slowest_cut, mut draw_sum, mut last) = (0.0f64, 0.0, None);
     let mut failed = None;
     let bar = indicatif::ProgressBar::new(args.frames.into());
-    headless::fly(&mut terrain, &path, &flight, &args.view.look(), &args.view.options(), |line, _| {
+    let look = args.view.look(terrain.scene());
+    headless::fly(&mut terrain, &path, &flight, &look, &args.view.options(), |line, _| {
         slowest_cut = slowest_cut.max(line.cut_ms);
         draw_sum += line.draw_ms;
         bar.inc(1);

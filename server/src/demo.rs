@@ -43,6 +43,15 @@ pub enum DemoError {
     Client,
 }
 
+/// A view among the mountains: the eye and what it looks at, each in parts of the whole and metres up.
+const NEAR: [[f64; 3]; 2] = [[0.5697, 0.4303, 4200.0], [0.6673, 0.6093, 1000.0]];
+
+/// Coordinates as the client's command line takes them.
+fn position([east, north, up]: [f64; 3], samples: u32) -> String {
+    let [x, y] = sample::place(east, north, samples);
+    format!("{x:.0},{y:.0},{up:.0}")
+}
+
 /// Makes the sample scene in `folder`, serves it at `listen` (any free port if that one is taken), draws a
 /// picture of it, says how to go on, and serves until interrupted, unless `headless`.
 ///
@@ -99,10 +108,10 @@ pub fn run(folder: &Path, samples: u32, listen: SocketAddr, headless: bool) -> R
             say(&format!("Picture: {}\nServing {url}", picture.display()));
             let program = client.display();
             say("Go on with, for instance:");
-            say(&format!(
-                "  {program} render {url} -o near.png --eye 655000,7955000,4200 --target 661000,7966000,1000"
-            ));
-            say(&format!("  curl '{url}/terrain/height?x=660000&y=7966000'"));
+            let [eye, target] = NEAR.map(|view| position(view, samples));
+            say(&format!("  {program} render {url} -o near.png --eye {eye} --target {target}"));
+            let [x, y] = sample::place(NEAR[1][0], NEAR[1][1], samples);
+            say(&format!("  curl '{url}/terrain/height?x={x:.0}&y={y:.0}'"));
         }
         if drawn.is_ok() && !headless {
             say("Press Ctrl-C to end.");
@@ -133,4 +142,22 @@ fn wait_for_interrupt() {
 fn say(line: &str) {
     // Standard output may be closed; the work goes on.
     let _ = writeln!(io::stdout(), "{line}");
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_near_view_is_above_ground() {
+        // The first half of the line of sight is free.
+        let [eye, target] = NEAR;
+        for step in 0..10 {
+            let part = f64::from(step) / 20.0;
+            let [x, y, z] = [0, 1, 2].map(|i| eye[i] + (target[i] - eye[i]) * part);
+            let ground = f64::from(sample::height(x, y).expect("land"));
+            assert!(z > ground + 300.0, "{part}: {z} m over {ground} m");
+        }
+        assert_eq!(position(eye, 2049), "655002,7954998,4200");
+    }
 }

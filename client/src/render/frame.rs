@@ -28,8 +28,29 @@ const LAND: [Stop; 8] = [
     (1.0, 0xfa_fb_fd),
 ];
 
+/// Bare rock and dust, lowest to highest.
+const ROCK: [Stop; 8] = [
+    (0.0, 0x4a_45_42),
+    (0.14, 0x5f_59_54),
+    (0.28, 0x77_6f_69),
+    (0.42, 0x8e_86_7f),
+    (0.56, 0xa5_9d_95),
+    (0.70, 0xbb_b3_aa),
+    (0.85, 0xd2_cb_c2),
+    (1.0, 0xec_e7_e0),
+];
+
 /// The sea, shallow to deep.
 const SEA: [Stop; 4] = [(0.0, 0xa9_d6_dd), (0.12, 0x62_ad_cc), (0.45, 0x2a_6c_a0), (1.0, 0x12_2f_5c)];
+
+/// The share of a layer's range of heights below 0 m that makes it a sea and not lowland or noise.
+const SEA_SHARE_MIN: f64 = 0.1;
+
+/// Summits up to here are hills, with no snow on them; from there on they are mountains, and white. Metres.
+const HILLS_TO_MOUNTAINS: [f64; 2] = [600.0, 3000.0];
+
+/// How far up the ramp of land the summits of hills reach.
+const HILLS: f64 = 0.62;
 
 const HORIZON: u32 = 0xd3_e0_ec;
 const ZENITH: u32 = 0x4f_80_bd;
@@ -62,7 +83,8 @@ pub(super) struct LayerUniform {
     per_depth: f32,
     land_base: f32,
     per_height: f32,
-    unused: [f32; 2],
+    exaggeration: f32,
+    unused: f32,
 }
 
 /// Where the eye is in a layer: the lattice point that positions are relative to.
@@ -74,12 +96,12 @@ pub(super) struct Reference {
 
 impl Reference {
     /// The lattice point and height nearest to the eye, no further than the GPU's integers reach.
-    pub(super) fn near(layer: &Layer, eye: DVec3) -> Self {
+    pub(super) fn near(layer: &Layer, eye: DVec3, exaggeration: f64) -> Self {
         #[allow(clippy::cast_possible_truncation, reason = "clamped just before")]
         let nearest = |value: f64| value.round().clamp(-5e8, 5e8) as i64;
         Self {
             lattice: [0, 1].map(|i| nearest((eye[i] - layer.origin[i]) / layer.cell[i])),
-            height: nearest((eye.z - layer.height_offset) / layer.quantum),
+            height: nearest((eye.z / exaggeration - layer.height_offset) / layer.quantum),
         }
     }
 
@@ -90,23 +112,43 @@ impl Reference {
     }
 
     /// The layer's uniforms.
-    pub(super) fn uniform(&self, layer: &Layer, eye: DVec3) -> LayerUniform {
+    pub(super) fn uniform(&self, layer: &Layer, eye: DVec3, look: &Look) -> LayerUniform {
         let offset = [0, 1].map(|i| layer.origin[i] + layer.cell[i] * self.lattice[i] as f64 - eye[i]);
-        let up_offset = self.height as f64 * layer.quantum + layer.height_offset - eye.z;
+        let height = self.height as f64 * layer.quantum + layer.height_offset;
         let [lowest, highest] = layer.heights;
-        let inverse = |range: f64| if range > 0.0 { single(1.0 / range) } else { 0.0 };
-        let land_base = lowest.max(0.0).min(highest);
+        let ratio = |part: f64, range: f64| if range > 0.0 { single(part / range) } else { 0.0 };
+        let sea = has_sea(look.colours, layer.heights);
+        let land_base = if sea { lowest.max(0.0).min(highest) } else { lowest };
         LayerUniform {
             cell: layer.cell.map(single),
             offset: offset.map(single),
-            quantum: single(layer.quantum),
-            up_offset: single(up_offset),
+            quantum: single(layer.quantum * look.exaggeration),
+            up_offset: single(height * look.exaggeration - eye.z),
             height: i32::try_from(self.height).unwrap_or(0),
-            per_depth: inverse(-lowest),
+            per_depth: if sea { ratio(1.0, -lowest) } else { 0.0 },
             land_base: single(land_base),
-            per_height: inverse(highest - land_base),
-            unused: [0.0; 2],
+            per_height: ratio(top(look.colours, highest), highest - land_base),
+            exaggeration: single(look.exaggeration),
+            unused: 0.0,
         }
+    }
+}
+
+/// Whether heights below 0 m are depths.
+fn has_sea(colours: Colours, [lowest, highest]: [f64; 2]) -> bool {
+    match colours {
+        Colours::Bathymetry => lowest < 0.0,
+        Colours::Auto => lowest < 0.0 && -lowest >= SEA_SHARE_MIN * (highest - lowest),
+        Colours::Terrain | Colours::Grey | Colours::Flat => false,
+    }
+}
+
+/// How far up the ramp the highest point stands: a low island has no snow.
+fn top(colours: Colours, highest: f64) -> f64 {
+    let [low, high] = HILLS_TO_MOUNTAINS;
+    match colours {
+        Colours::Grey => 1.0,
+        _ => HILLS + (1.0 - HILLS) * ((highest - low) / (high - low)).clamp(0.0, 1.0),
     }
 }
 
@@ -132,7 +174,7 @@ impl FrameUniform {
             horizon: colour(HORIZON, look.haze * HAZE_PER_METRE),
             zenith: colour(ZENITH, 0.0),
             options: [flag(encode), flag(look.show_levels), flag(look.colours == Colours::Flat), 0.0],
-            land: LAND.map(|(at, srgb)| colour(srgb, at)),
+            land: if look.colours == Colours::Grey { ROCK } else { LAND }.map(|(at, srgb)| colour(srgb, at)),
             sea: SEA.map(|(at, srgb)| colour(srgb, at)),
         }
     }
@@ -228,8 +270,7 @@ mod tests {
     fn uniforms_have_the_layout_of_their_twins() {
         let frame = twin!(FrameUniform: clip_from_eye right up forward sun horizon zenith options land sea);
         assert_eq!(layout("Frame"), frame);
-        let layer =
-            twin!(LayerUniform: cell offset quantum up_offset height per_depth land_base per_height unused);
+        let layer = twin!(LayerUniform: cell offset quantum up_offset height per_depth land_base per_height exaggeration unused);
         assert_eq!(layout("Layer"), layer);
         let sizes = [size_of::<FrameUniform>(), size_of::<LayerUniform>()];
         assert!(sizes.iter().all(|s| s.is_multiple_of(16)), "WebGL2 wants it");
@@ -241,9 +282,27 @@ mod tests {
         assert!((linear(0x80_80_80)[0] - 0.215_86).abs() < 1e-4);
     }
 
+    /// The Moon, the noise of a flat coast and a dry valley were drawn as seas.
+    #[test]
+    fn only_a_deep_part_is_sea() {
+        let sea = |heights| has_sea(Colours::Auto, heights);
+        for heights in
+            [[-2153.0, 1599.0], [-0.135, 0.125], [-30.0, 108.8], [-2339.0, -19.0], [-1431.0, 100.0]]
+        {
+            assert!(sea(heights), "{heights:?}");
+        }
+        for heights in
+            [[-3.0, 146.0], [-28.0, 1077.0], [-16.0, 3742.0], [-86.0, 3368.0], [0.0, 0.0], [5.0, 9.0]]
+        {
+            assert!(!sea(heights), "{heights:?}");
+        }
+        assert!(has_sea(Colours::Bathymetry, [-3.0, 146.0]) && !has_sea(Colours::Terrain, [-3e3, 1.0]));
+        assert_eq!([146.0, 4128.0].map(|h| top(Colours::Auto, h)), [HILLS, 1.0]);
+    }
+
     #[test]
     fn stops_rise() {
-        for ramp in [&LAND[..], &SEA[..]] {
+        for ramp in [&LAND[..], &ROCK[..], &SEA[..]] {
             assert!(ramp.is_sorted_by(|a, b| a.0 < b.0));
         }
     }

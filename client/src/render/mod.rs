@@ -21,9 +21,9 @@ mod tests;
 
 pub use offscreen::Offscreen;
 
-use crate::camera::Camera;
+use crate::camera::{Bounds, Camera};
 use crate::drawing::DrawItem;
-use diamantina_protocol::message::Layer;
+use diamantina_protocol::message::{Layer, Scene};
 use frame::{FrameUniform, LayerUniform, Reference, single};
 use glam::DVec3;
 use resident::{Residents, SurfacePoint, Triangles};
@@ -39,7 +39,7 @@ const DEPTH: wgpu::TextureFormat = wgpu::TextureFormat::Depth32Float;
 /// Bytes from one layer's uniforms to the next: the largest alignment that WebGPU and WebGL2 ask for.
 const LAYER_STRIDE: usize = 256;
 
-/// The nearest that the near plane comes to the eye, in metres.
+/// The nearest that the near plane comes to the eye, in metres, unless cells are smaller.
 const NEAR_MIN: f64 = 0.05;
 
 /// The farthest that the near plane goes, in metres, whatever lies beyond.
@@ -74,6 +74,8 @@ pub struct Look {
     pub colours: Colours,
     /// The thickness of the air: 0 is none, 1 a clear day.
     pub haze: f32,
+    /// What heights are multiplied by; above 0. The camera's positions count in stretched heights.
+    pub exaggeration: f64,
     /// Whether to tint diamonds by level.
     pub show_levels: bool,
 }
@@ -83,11 +85,35 @@ impl Default for Look {
         Self {
             background: Background::Sky,
             sun: Sun::default(),
-            colours: Colours::Hypsometric,
+            colours: Colours::Auto,
             haze: 1.0,
+            exaggeration: 1.0,
             show_levels: false,
         }
     }
+}
+
+impl Look {
+    /// How a scene looks unless told otherwise: other bodies than the Earth are grey, without air, and the sun
+    /// stands low, as plains of dust show little relief else.
+    #[must_use]
+    pub fn of(scene: &Scene) -> Self {
+        let radius = scene.frame.crs.as_ref().and_then(|crs| crs.proj4.as_deref()).and_then(radius);
+        if radius.is_none_or(|metres| (metres - EARTH_RADIUS).abs() < 100_000.0) {
+            return Self::default();
+        }
+        let black = Background::Colour([0.003, 0.003, 0.004, 1.0]);
+        let sun = Sun { altitude_degrees: 20.0, ..Sun::default() };
+        Self { background: black, sun, colours: Colours::Grey, haze: 0.0, ..Self::default() }
+    }
+}
+
+/// Metres from the Earth's centre, give or take 20 km.
+const EARTH_RADIUS: f64 = 6_371_000.0;
+
+/// The radius that a PROJ string names by number, in metres.
+fn radius(proj4: &str) -> Option<f64> {
+    proj4.split_whitespace().find_map(|w| w.strip_prefix("+R=").or(w.strip_prefix("+a=")))?.parse().ok()
 }
 
 /// What is seen where no terrain is.
@@ -127,8 +153,15 @@ impl Sun {
 /// What terrain is coloured by.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Colours {
-    /// Height, over the layer's range; below 0 m, depth.
-    Hypsometric,
+    /// As `Bathymetry` for layers a good part of whose range is below 0 m, as `Terrain` for others: lowlands
+    /// and noise around 0 m are no sea.
+    Auto,
+    /// Height, over the layer's range.
+    Terrain,
+    /// Height, and depth below 0 m.
+    Bathymetry,
+    /// Height, from dark to light grey: for bodies without plants and water.
+    Grey,
     /// Nothing: one grey.
     Flat,
 }
@@ -169,6 +202,12 @@ pub enum RenderError {
     /// The picture was drawn but did not come back.
     #[error("the picture could not be read back from the graphics adapter: {0}")]
     Read(String),
+}
+
+/// A box with its heights multiplied.
+fn stretched(bounds: Bounds, exaggeration: f64) -> Bounds {
+    let by = DVec3::new(1.0, 1.0, exaggeration);
+    Bounds { min: bounds.min * by, max: bounds.max * by }
 }
 
 /// A diamond's place, as the vertex shader takes it.
@@ -288,7 +327,7 @@ impl Renderer {
         view: &wgpu::TextureView,
     ) -> FrameStats {
         let uploaded_bytes = self.residents.start_frame(&self.device, layers, items);
-        let draws = self.in_view(layers, camera, items);
+        let draws = self.in_view(layers, camera, items, look.exaggeration);
         self.write_uniforms(layers, camera, look, &draws);
         let attachments = match self.attachments.take() {
             Some(old) if old.size == camera.size => old,
@@ -313,13 +352,20 @@ impl Renderer {
 
     /// The items that the camera may see, in an order that switches index buffers seldom and draws what
     /// is near first, so that it hides what is behind at the least cost.
-    fn in_view<'a>(&self, layers: &[Layer], camera: &Camera, items: &'a [DrawItem]) -> Vec<Draw<'a>> {
+    fn in_view<'a>(
+        &self,
+        layers: &[Layer],
+        camera: &Camera,
+        items: &'a [DrawItem],
+        exaggeration: f64,
+    ) -> Vec<Draw<'a>> {
         let planes = camera.planes();
         let mut draws: Vec<_> = items
             .iter()
             .filter_map(|item| {
                 let resident = self.residents.get(item)?;
-                let bounds = resident.bounds.filter(|b| b.touches(&planes))?;
+                let bounds = resident.bounds.map(|b| stretched(b, exaggeration));
+                let bounds = bounds.filter(|b| b.touches(&planes))?;
                 let upper = layers.get(item.layer)?.forest.local(item.diamond).upper;
                 let sides = item.sides & if upper { 0b1111 } else { 0b0011 };
                 let distance = bounds.distance(camera.eye);
@@ -336,16 +382,18 @@ impl Renderer {
     fn write_uniforms(&mut self, layers: &[Layer], camera: &Camera, look: &Look, draws: &[Draw<'_>]) {
         let nearest = draws.iter().map(|d| d.distance).fold(NEAR_MAX, f64::min);
         // A little before the nearest box: rounding must not cut it.
-        let near = single((0.9 * nearest).max(NEAR_MIN));
+        let cells = layers.iter().flat_map(|layer| layer.cell);
+        let near = single((0.9 * nearest).max(cells.fold(NEAR_MIN, f64::min)));
         let frame = FrameUniform::new(camera, look, near, !self.options.format.is_srgb());
         self.queue.write_buffer(&self.frame_uniform, 0, bytemuck::bytes_of(&frame));
 
-        let references: Vec<_> = layers.iter().map(|layer| Reference::near(layer, camera.eye)).collect();
+        let references: Vec<_> =
+            layers.iter().map(|layer| Reference::near(layer, camera.eye, look.exaggeration)).collect();
         let mut uniforms = vec![0u8; LAYER_STRIDE * layers.len().max(1)];
         for ((layer, reference), slot) in
             layers.iter().zip(&references).zip(uniforms.chunks_mut(LAYER_STRIDE))
         {
-            let uniform = reference.uniform(layer, camera.eye);
+            let uniform = reference.uniform(layer, camera.eye, look);
             slot[..size_of::<LayerUniform>()].copy_from_slice(bytemuck::bytes_of(&uniform));
         }
         let (buffer, _) = match self.layers.take() {

@@ -48,7 +48,7 @@ pub(super) struct Resident {
     pub(super) points: wgpu::Buffer,
     /// Its own index lists, if it has nodata.
     pub(super) own: Option<Triangles>,
-    /// The box around all its points; `None` if none has a height.
+    /// The box around all its points; `None` if nothing is there to draw.
     pub(super) bounds: Option<Bounds>,
     bytes: u64,
     last_frame: u64,
@@ -170,7 +170,9 @@ impl Resident {
         });
         let own = surface.has_nodata().then(|| Triangles::new(device, triangles::lists_of(surface.block())));
         let bytes = points.size() + own.as_ref().map_or(0, |t| t.indices.size());
-        let bounds = bounds(layer, item.diamond, heights);
+        // Lone points make no triangles, and an empty buffer cannot be drawn from.
+        let is_empty = own.as_ref().is_some_and(|t| t.indices.size() == 0);
+        let bounds = if is_empty { None } else { bounds(layer, item.diamond, heights) };
         Self { surface: Arc::downgrade(surface), points, own, bounds, bytes, last_frame: frame }
     }
 }

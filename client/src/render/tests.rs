@@ -25,8 +25,9 @@ const MAGENTA: Background = Background::Colour([1.0, 0.0, 1.0, 1.0]);
 const PLAIN: Look = Look {
     background: MAGENTA,
     sun: Sun { azimuth_degrees: 315.0, altitude_degrees: 45.0 },
-    colours: Colours::Hypsometric,
+    colours: Colours::Terrain,
     haze: 0.0,
+    exaggeration: 1.0,
     show_levels: false,
 };
 
@@ -267,7 +268,7 @@ fn mean(picture: &Picture, x: f64, y: f64) -> [f64; 3] {
 fn north_is_up_and_east_is_right() {
     // A high plateau in the north-east, the rest low.
     let forest = Forest::new(5, 3, [1, 1]).unwrap();
-    let world = World::new(forest, 30.0, |x, y| if x > 18 && y > 18 { 500 } else { 0 });
+    let world = World::new(forest, 3000.0, |x, y| if x > 18 && y > 18 { 35_000 } else { 0 });
     let picture = picture(&world, &world.overhead([300, 300]), &world.level(4), &PLAIN);
     let corners = [(0.65, 0.35), (0.35, 0.35), (0.35, 0.65), (0.65, 0.65)].map(|(x, y)| mean(&picture, x, y));
     assert!(corners[0].iter().all(|c| *c > 190.0), "summits are white: {corners:?}");
@@ -320,6 +321,57 @@ fn the_eye_may_be_very_near_or_very_far() {
         let camera = Camera { eye, target: eye - DVec3::Z, fov_y, size: [64, 64] };
         let picture = picture(&world, &camera, &world.level(4), &PLAIN);
         assert!(!is_background(&picture, 32, 32), "{above} m above");
+    }
+}
+
+/// The first diamond that had heights but no triangle ended the program: an empty buffer cannot be bound.
+#[test]
+fn lone_points_draw_nothing() {
+    let world = World::new(Forest::new(5, 3, [1, 1]).unwrap(), 30.0, |x, y| {
+        if x % 8 == 4 && y % 8 == 4 { 300 } else { NODATA }
+    });
+    let camera = world.overhead([64, 64]);
+    for level in 1..=4 {
+        let picture = picture(&world, &camera, &world.level(level), &PLAIN);
+        assert!((0..64).all(|i| is_background(&picture, i, i)), "level {level}");
+    }
+}
+
+#[test]
+fn exaggeration_stretches_heights() {
+    // A wall across the middle, seen from the south: the outline of its top rises as its height does.
+    let world = World::new(Forest::new(5, 3, [1, 1]).unwrap(), 30.0, |_, y| if y == 16 { 400 } else { 0 });
+    let camera = Camera {
+        eye: world.place(0.5, -1.0, 300.0),
+        target: world.place(0.5, 0.5, 0.0),
+        fov_y: FOV_Y,
+        size: [200, 200],
+    };
+    for exaggeration in [1.0, 5.0] {
+        let look = Look { exaggeration, ..PLAIN };
+        let picture = picture(&world, &camera, &world.level(4), &look);
+        let back = pixel_of(&camera, world.place(0.5, 1.0, 0.0))[1];
+        let wall = pixel_of(&camera, world.place(0.5, 0.5, 40.0 * exaggeration))[1];
+        let top = (0..200).find(|y| !is_background(&picture, 100, *y)).unwrap();
+        assert!((f64::from(top) - wall.min(back)).abs() < 1.5, "{exaggeration}: {top} {wall} {back}");
+    }
+}
+
+#[test]
+fn other_bodies_are_grey() {
+    use diamantina_protocol::message::{Crs, Frame};
+    let look = |proj4: Option<&str>| {
+        let proj4 = proj4.map(str::to_owned);
+        let crs = Crs { name: String::new(), proj4, origin: [0.0; 2], per_metre: [1.0; 2] };
+        let frame = Frame { crs: Some(crs), vertical_unit: "metre".into() };
+        Look::of(&Scene { name: "s".into(), version: "v".into(), frame, layers: vec![], zones: vec![] })
+    };
+    for earth in [None, Some("+proj=utm +zone=11 +datum=WGS84"), Some("+proj=merc +a=6378137 +b=6378137")] {
+        assert_eq!(look(earth), Look::default());
+    }
+    for other in ["+proj=eqc +lat_ts=0 +R=1737400", "+proj=tmerc +a=3396190 +b=3376200"] {
+        let look = look(Some(other));
+        assert!(look.colours == Colours::Grey && look.haze == 0.0, "{look:?}");
     }
 }
 

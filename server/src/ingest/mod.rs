@@ -30,6 +30,7 @@ mod usgs_dem;
 use std::fmt;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom, Write};
+use std::num::NonZeroU32;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -51,6 +52,8 @@ const CACHE_BYTES: usize = 128 << 20;
 const UNPACKED_BYTES_MAX: u64 = 64 << 30;
 /// Widest geographic source that one UTM zone may carry, degrees; the scale is 6 % off at its rims.
 const UTM_DEGREES_MAX: f64 = 40.0;
+/// Cells of a source without CRS may be degrees below this: 11 km, coarser than any DEM on land.
+const DEGREES_STEP_MAX: f64 = 0.1;
 
 /// What the command line may say about sources.
 #[derive(Clone, Debug, Default, clap::Args)]
@@ -59,7 +62,11 @@ pub struct Options {
     /// resampled) or EPSG:N (resampled bilinearly)
     #[arg(long, value_name = "auto|source|EPSG:N", default_value_t = CrsChoice::Auto)]
     pub crs: CrsChoice,
-    /// Metres between samples, when reprojecting or for a source that does not say (PNG, raw)
+    /// CRS of the sources that do not say theirs, such as EPSG:4326 for degrees
+    #[arg(long, value_name = "EPSG:N", value_parser = parse_epsg)]
+    pub assume_crs: Option<NonZeroU32>,
+    /// Metres between samples, when reprojecting or for a source that does not say (PNG, raw, degrees
+    /// without a CRS)
     #[arg(long, value_name = "METRES")]
     pub cell: Option<f64>,
     /// Metres of height in one unit of value [default: from the file, else 1]
@@ -74,6 +81,12 @@ pub struct Options {
     /// Read the files as bare little-endian samples, rows from the north; types u8 i16 u16 i32 u32 f32 f64
     #[arg(long, value_name = "WIDTHxHEIGHT:TYPE")]
     pub raw: Option<RawShape>,
+}
+
+/// The number in `EPSG:N`.
+fn parse_epsg(text: &str) -> std::result::Result<NonZeroU32, String> {
+    let code = text.to_ascii_lowercase().strip_prefix("epsg:").and_then(|n| n.parse().ok());
+    code.ok_or_else(|| format!("expected EPSG:N, such as EPSG:4326, found '{text}'"))
 }
 
 /// Which CRS the frame has.
@@ -206,6 +219,7 @@ pub fn open(paths: &[PathBuf], options: &Options) -> std::result::Result<Source,
     for (id, path) in (0..).zip(paths) {
         let mut raster = open_file(path, options, &cache, id)?;
         override_values(&mut raster, options)?;
+        assume_crs(&mut raster, options)?;
         rasters.push(raster);
     }
     let mosaic = Mosaic::new(rasters)?;
@@ -385,6 +399,43 @@ fn override_values(raster: &mut Raster, options: &Options) -> Result<()> {
     Ok(())
 }
 
+/// Gives a source without CRS the one that the command line names.
+fn assume_crs(raster: &mut Raster, options: &Options) -> Result<()> {
+    let Some(code) = options.assume_crs else { return Ok(()) };
+    let Some(place) = &mut raster.place else {
+        return Err(bad_options(
+            &raster.file,
+            "--assume-crs only for a file that says where it lies",
+            "one that says nothing of its place",
+            "leave --assume-crs out and give --cell METRES",
+        ));
+    };
+    if place.crs.is_none() {
+        let crs = SourceCrs::epsg(code.get(), false);
+        if crs.proj4.is_none() {
+            return Err(bad_options(
+                &raster.file,
+                "--assume-crs with a known EPSG code",
+                crs.name,
+                "choose another code, such as EPSG:4326 for degrees",
+            ));
+        }
+        place.crs = Some(crs);
+    }
+    Ok(())
+}
+
+/// Whether coordinates without a CRS must be longitudes and latitudes: small cells in the range of degrees,
+/// away from (0, 0), where the local systems of laboratories and sites begin.
+fn looks_like_degrees(mosaic: &Mosaic, place: &Place) -> bool {
+    let sides = [(0, mosaic.width, 180.0), (1, mosaic.height, 90.0)];
+    sides.into_iter().all(|(axis, samples, limit)| {
+        let (low, step) = (place.origin[axis], place.step[axis]);
+        let high = low + step * f64::from(samples - 1);
+        step < DEGREES_STEP_MAX && low >= -limit && high <= limit && (low > 1.0 || high < -1.0)
+    })
+}
+
 /// Decides the frame: the source's own lattice or a resampled one.
 fn frame(file: &Path, mosaic: &Mosaic, options: &Options) -> Result<(Grid, Option<Reprojection>)> {
     let Some(place) = &mosaic.place else {
@@ -397,6 +448,23 @@ fn frame(file: &Path, mosaic: &Mosaic, options: &Options) -> Result<(Grid, Optio
         })?;
         return Ok((grid(mosaic, [0.0; 2], [cell; 2], None), None));
     };
+    if place.crs.is_none() && looks_like_degrees(mosaic, place) && !matches!(options.crs, CrsChoice::Epsg(_))
+    {
+        // As metres they would make a scene of centimetres.
+        let [x, y] = place.origin;
+        return match options.cell {
+            Some(cell) => Ok((grid(mosaic, [0.0; 2], [cell; 2], None), None)),
+            None => Err(bad_options(
+                file,
+                "a CRS, or coordinates in metres",
+                format!(
+                    "no CRS, cells of {} and a corner at {x:.4}, {y:.4}, which look like degrees",
+                    place.step[0]
+                ),
+                "say --assume-crs EPSG:4326 if they are degrees, or --cell METRES to take the samples as they are",
+            )),
+        };
+    }
     let target = match (options.crs, &place.crs) {
         (CrsChoice::Source, _) | (CrsChoice::Auto, None) => None,
         (CrsChoice::Auto, Some(crs)) if crs.geographic => Some(natural_crs(file, mosaic, place, crs)?),
@@ -425,7 +493,7 @@ fn no_crs(file: &Path, asked: &str) -> IngestError {
         file,
         format!("a source with a CRS, to reproject it to {asked}"),
         "none in the file",
-        "leave --crs out, or add the CRS, for instance with gdal_edit.py -a_srs",
+        "say --assume-crs EPSG:N if you know it, or leave --crs out",
     )
 }
 

@@ -46,7 +46,15 @@ fn the_command_line_says_it_all() {
     assert_eq!((options.crs, options.nodata), (CrsChoice::Epsg(32632), Some(-9999.0)));
     assert_eq!(options.raw, Some(RawShape { width: 7, height: 9, dtype: Dtype::I16 }));
     assert_eq!(parse("x").unwrap().crs, CrsChoice::Auto);
-    for wrong in ["x --crs utm", "x --crs EPSG:-1", "x --raw 7x0:i16", "x --raw 7x9:i64", "x --nodata no"] {
+    assert_eq!(parse("x --assume-crs epsg:4326").unwrap().assume_crs, NonZeroU32::new(4326));
+    for wrong in [
+        "x --crs utm",
+        "x --crs EPSG:-1",
+        "x --assume-crs 4326",
+        "x --raw 7x0:i16",
+        "x --raw 7x9:i64",
+        "x --nodata no",
+    ] {
         assert!(parse(wrong).is_err(), "{wrong}");
     }
 }
@@ -442,6 +450,40 @@ fn resampling_keeps_nodata_out_of_its_neighbours() {
     assert!((1..=9).contains(&holes), "{holes}");
 }
 
+/// A grid of degrees that did not say so became a scene of 6 cm.
+#[test]
+fn degrees_without_a_crs_are_refused_or_assumed() {
+    let folder = folder();
+    let plain = |origin: [f64; 2], step: f64| {
+        let tags = Tags { origin, step, ..Tags::new(&[]) };
+        let bytes = tiff!(colortype::GrayI16, 20, 20, [7i16; 400], &tags);
+        [put(&folder, "plain.tif", &bytes)]
+    };
+    let degrees = plain([-155.1, 19.75], 1e-4);
+    for options in [Options::default(), source_crs()] {
+        let message = open(&degrees, &options).unwrap_err().to_string();
+        let words = ["plain.tif", "look like degrees", "--assume-crs EPSG:4326", "--cell METRES"];
+        assert!(words.iter().all(|w| message.contains(w)), "{message}");
+    }
+    let assumed = Options { assume_crs: NonZeroU32::new(4326), ..Options::default() };
+    let grid = open(&degrees, &assumed).unwrap().grid().clone();
+    assert_eq!(grid.crs.unwrap().name, "EPSG:32605");
+    assert!((grid.cell[0] - 10.8).abs() < 0.2, "{:?}", grid.cell);
+    let as_it_is = Options { cell: Some(10.0), ..Options::default() };
+    let grid = open(&degrees, &as_it_is).unwrap().grid().clone();
+    assert_eq!((grid.crs, grid.origin, grid.cell), (None, [0.0; 2], [10.0; 2]));
+    // A wave tank at (0, 0), a site in metres, a source with a CRS: all as before.
+    for (origin, step) in [([0.0, 3.4], 0.014), ([382_250.0, 6_354_700.0], 1.0), ([-155.1, 19.75], 30.0)] {
+        let grid = open(&plain(origin, step), &Options::default()).unwrap().grid().clone();
+        assert_eq!((grid.crs, grid.cell), (None, [step; 2]));
+    }
+    let known = tiff!(colortype::GrayI16, 20, 20, [7i16; 400], &Tags::utm());
+    let known = [put(&folder, "known.tif", &known)];
+    assert_eq!(open(&known, &assumed).unwrap().grid().crs.as_ref().unwrap().name, "EPSG:32632");
+    let unknown = Options { assume_crs: NonZeroU32::new(1), ..Options::default() };
+    assert!(open(&degrees, &unknown).unwrap_err().to_string().contains("known EPSG code"));
+}
+
 #[test]
 fn the_same_crs_is_not_resampled() {
     let folder = folder();
@@ -760,7 +802,9 @@ fn every_real_dem_is_as_its_manifest_says() {
             continue;
         }
         let cell = file.ends_with(".png").then_some(1.0);
-        let source = open(&[folder.join(file)], &Options { cell, ..source_crs() });
+        // Degrees, though the file does not say so.
+        let assume_crs = file.contains("hilo").then(|| NonZeroU32::new(4326)).flatten();
+        let source = open(&[folder.join(file)], &Options { cell, assume_crs, ..source_crs() });
         let source = source.unwrap_or_else(|e| panic!("{e}"));
         let grid = source.grid();
         assert_eq!(row["cols"], grid.width.to_string(), "{file}");
