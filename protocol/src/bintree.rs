@@ -28,6 +28,10 @@ pub const ROOTS_MAX: u32 = 1024;
 /// Smallest and largest base-2 logarithm of the segments of a patch's leg.
 pub const PATCH_LOG2: std::ops::RangeInclusive<u8> = 2..=7;
 
+/// Base-2 logarithm of the most squares of finest patches: 2^48 samples at 64 segments. Keeps the pages of
+/// an index within 32 bits.
+pub const PATCHES_LOG2_MAX: u32 = 36;
+
 /// The squares that cover a layer, and how finely each is cut.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
 #[serde(try_from = "ForestParts", into = "ForestParts")]
@@ -61,6 +65,12 @@ pub enum ForestError {
         found: u8,
         /// The exponent of the patch.
         patch: u8,
+    },
+    /// More patches than an index can count.
+    #[error("2^{found} patches along x and y together: expected at most 2^{PATCHES_LOG2_MAX}")]
+    Patches {
+        /// The base-2 logarithm found, rounded up.
+        found: u32,
     },
     /// No root squares, or too many.
     #[error("{0} x {1} root squares: expected 1 to {ROOTS_MAX} along each axis")]
@@ -97,6 +107,10 @@ impl Forest {
         let in_range = |n: u32| (1..=ROOTS_MAX).contains(&n) && u64::from(n) << root_log2 < 1 << 28;
         if !in_range(roots[0]) || !in_range(roots[1]) {
             return Err(ForestError::Roots(roots[0], roots[1]));
+        }
+        let squares = (u64::from(roots[0]) * u64::from(roots[1])) << (2 * u32::from(root_log2 - patch_log2));
+        if squares > 1 << PATCHES_LOG2_MAX {
+            return Err(ForestError::Patches { found: squares.next_power_of_two().trailing_zeros() });
         }
         Ok(Self { root_log2, patch_log2, roots })
     }
@@ -291,6 +305,8 @@ mod tests {
         assert_eq!(Forest::new(6, 6, [1, 1]), Err(ForestError::Root { found: 6, patch: 6 }));
         assert_eq!(Forest::new(8, 6, [0, 1]), Err(ForestError::Roots(0, 1)));
         assert!(Forest::new(24, 6, [1024, 1]).is_err(), "coordinates beyond 28 bits");
+        // A scene that a fuzzer made up: its pages did not fit 32 bits.
+        assert_eq!(Forest::new(24, 2, [15, 15]), Err(ForestError::Patches { found: 52 }));
         assert!(serde_json_like(9, 12).is_err());
         fn serde_json_like(root_log2: u8, patch_log2: u8) -> Result<Forest, ForestError> {
             ForestParts { root_log2, patch_log2, roots: [1, 1] }.try_into()
