@@ -2,9 +2,10 @@
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use diamantina_client::camera::{Camera, FOV_Y};
+use diamantina_client::fetch::FetchError;
 use diamantina_client::headless::{self, Flight, FlightPath, FrameLine, PictureReport};
 use diamantina_client::render::{self, Background, Colours, Look, Sun};
-use diamantina_client::terrain::{self, Terrain};
+use diamantina_client::terrain::{self, Terrain, TerrainError};
 use diamantina_protocol::message::Scene;
 use glam::DVec3;
 use std::io::Write;
@@ -223,7 +224,10 @@ impl ViewArgs {
             encoding,
             ..terrain::Options::default()
         };
-        Ok(Terrain::open(&self.url, options)?)
+        Terrain::open(&self.url, options).map_err(|error| {
+            let wrong_use = matches!(error, TerrainError::Fetch(FetchError::Address { .. }));
+            Failure(if wrong_use { 2 } else { 1 }, error.to_string())
+        })
     }
 
     fn look(&self, scene: &Scene) -> Look {

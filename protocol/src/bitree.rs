@@ -304,7 +304,12 @@ mod tests {
                     let ((a, ha), (b, hb)) = (t[i], t[(i + 1) % 3]);
                     let steps = a[0].abs_diff(b[0]).max(a[1].abs_diff(b[1]));
                     for s in 1..steps {
-                        let along = |from: u32, to: u32| (i64::from(from) + (i64::from(to) - i64::from(from)) * i64::from(s) / i64::from(steps)) as u32;
+                        // One step along each axis that the side runs along, forwards or backwards.
+                        let along = |from: u32, to: u32| match from.cmp(&to) {
+                            std::cmp::Ordering::Less => from + s,
+                            std::cmp::Ordering::Equal => from,
+                            std::cmp::Ordering::Greater => from - s,
+                        };
                         let p = [along(a[0], b[0]), along(a[1], b[1])];
                         if let Some(h) = corners.get(&p) {
                             let side = ha + (hb - ha) * f64::from(s) / f64::from(steps);

@@ -224,9 +224,9 @@ fn build(args: BuildArgs) -> Result<(), Failure> {
         },
         memory: args.memory,
     };
-    let source = ingest::open(&args.sources, &args.ingest).map_err(|e| refuse_build(&[], e.into()))?;
+    let source = ingest::open(&args.sources, &args.ingest).map_err(|e| refuse_build(&[], &e.into()))?;
     let report = hierarchy::build(&source, &args.output, &options, &Progress::new())
-        .map_err(|e| refuse_build(&args.sources, e))?;
+        .map_err(|e| refuse_build(&args.sources, &e))?;
     let mut out = std::io::stdout().lock();
     if args.json {
         writeln!(out, "{}", serde_json::to_string_pretty(&report)?)?;
@@ -237,7 +237,7 @@ fn build(args: BuildArgs) -> Result<(), Failure> {
 }
 
 /// Options that make no sense, or not for this source, are wrong use; all else is failure.
-fn refuse_build(sources: &[PathBuf], error: BuildError) -> Failure {
+fn refuse_build(sources: &[PathBuf], error: &BuildError) -> Failure {
     let wrong_use = matches!(
         error,
         BuildError::MaxError { .. }
