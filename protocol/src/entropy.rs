@@ -2,7 +2,7 @@
 //!
 //! Range coding itself is the `constriction` crate's; ours are the adaptive probabilities and the way in
 //! which an integer becomes bits ([`Magnitude`]). A context learns fast at first and settles: its rate is
-//! 1/(count+2) until it reaches 1/2^[`SLOWEST`].
+//! 1/(count+2) until it reaches 1/64.
 
 use constriction::backends::Cursor;
 use constriction::stream::model::{DecoderModel, EncoderModel, EntropyModel};

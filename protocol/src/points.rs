@@ -16,7 +16,7 @@
 //! **Steps.** Level l uses `fine * 3^e[l]`, fine = 2E+1 quanta, with exponents that fall to 0. A step
 //! three times as fine splits each interval into three equal ones, so a correction costs what was
 //! saved before. The last diamond that has a point strictly inside gives it the fine step: see
-//! [`Coding::exponent`]. So coarse views do not pay for fine precision, and the finest is as promised.
+//! `Coding::exponent`. So coarse views do not pay for fine precision, and the finest is as promised.
 //!
 //! | offset | size | field | valid range |
 //! |---|---|---|---|
