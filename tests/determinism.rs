@@ -74,11 +74,11 @@ fn too_little_memory_is_refused_with_what_is_needed() {
         (output.status.code(), String::from_utf8(output.stderr).unwrap())
     };
     let (code, message) = try_with("64MiB");
-    assert_eq!(code, Some(1), "{message}");
+    assert_eq!(code, Some(2), "{message}");
     let needed = message.trim_end().rsplit(' ').next().unwrap();
     assert!(message.contains("--memory") && needed.parse::<u64>().is_ok(), "{message}");
     // What the message asks for is enough, and a byte less is not.
     let (code, message) = try_with(needed);
     assert_eq!(code, Some(0), "{message}");
-    assert_eq!(try_with(&(needed.parse::<u64>().unwrap() - 1).to_string()).0, Some(1));
+    assert_eq!(try_with(&(needed.parse::<u64>().unwrap() - 1).to_string()).0, Some(2));
 }
