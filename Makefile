@@ -4,6 +4,9 @@ SHELL := bash
 .NOTPARALLEL:
 .PHONY: help demo test check bench setup fmt clippy tests doc deny wasm scripts
 
+# Mesa's device selection complains where there is no desktop session; there is nothing to select.
+export NODEVICE_SELECT := 1
+
 step := scripts/step
 target := $(or $(CARGO_TARGET_DIR),target)
 
