@@ -301,10 +301,6 @@ fn dems(folder: &Path) -> Vec<(PathBuf, ingest::Options)> {
         .collect()
 }
 
-/// Samples beyond which one build stands for all, unless `DIAMANTINA_ALL` is set: the other five take ten
-/// minutes.
-const LARGE: usize = 8 << 20;
-
 /// Checks one DEM with some options.
 fn check_all(dem: &Path, ingest: &ingest::Options, cases: &[(f64, Rule)]) {
     let source = ingest::open(&[dem.to_owned()], ingest).unwrap();
@@ -328,11 +324,7 @@ fn every_sample_of_every_real_dem_is_within_the_declared_error_at_every_level() 
     let Some(folder) = data() else { return };
     let mut seen = 0;
     for (dem, ingest) in dems(&folder) {
-        let source = ingest::open(std::slice::from_ref(&dem), &ingest).unwrap();
-        let large = source.grid().width as usize * source.grid().height as usize > LARGE;
-        drop(source);
-        let all = !large || std::env::var_os("DIAMANTINA_ALL").is_some();
-        check_all(&dem, &ingest, if all { &CASES } else { &CASES[2..3] });
+        check_all(&dem, &ingest, &CASES);
         seen += 1;
     }
     let _ = writeln!(std::io::stderr(), "law 3: {seen} DEMs as they are");
