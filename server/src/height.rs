@@ -119,7 +119,10 @@ pub fn height(
     // The triangle of the finest level is half of a square of n cells; its apex is the corner off the
     // diagonal, and centres the diamond whose split drew it.
     let square = [i / n, j / n];
-    let [u, v] = [at[0] - f64::from(square[0] * n), at[1] - f64::from(square[1] * n)];
+    // Told by the centroid of the small triangle: a sample may lie on the diagonal, a centroid never does, and
+    // all three corners are then in the diamond's block.
+    let [u, v] = [0, 1]
+        .map(|axis| corners.iter().map(|(c, _)| f64::from(c[axis] - square[axis] * n)).sum::<f64>() / 3.0);
     let side = f64::from(n);
     let rising = (square[0] + square[1]).is_multiple_of(2);
     let (east, north) = if rising { (u >= v, u < v) } else { (u + v > side, u + v > side) };
