@@ -217,6 +217,7 @@ impl Shared {
             // The index was not there to tell that there is none.
             Status::Missing if bytes.is_none() && header.length == 0 => {}
             Status::Missing | Status::Damaged => return Err(FetchError::Missing(d.centre())),
+            Status::Page => return Err(FetchError::Unasked(d.centre())),
             Status::Ok => {}
         }
         self.deliver(Key::Diamond(layer, d), Event::Payload(layer, d, payload));
