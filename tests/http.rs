@@ -3,7 +3,9 @@
 use crate::world::{Dice, World, build, options, serve, write_raw};
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::{self, Entry};
-use diamantina_protocol::message::{self, BATCH_MAX, FrameHeader, HeightAnswer, Layer, Problem, Status, StreamAsk};
+use diamantina_protocol::message::{
+    self, BATCH_MAX, FrameHeader, HeightAnswer, Layer, Problem, Status, StreamAsk,
+};
 use diamantina_server::projection::{self, Projection};
 use diamantina_server::store::Store;
 use diamantina_server::{ingest, inspect};

@@ -597,7 +597,11 @@ fn a_picture_from_a_stream_is_the_same_picture_in_one_round_trip() {
     for key in ["complete", "largest_error_pixels", "triangles_drawn"] {
         assert_eq!(usual[key], streamed[key], "{key}");
     }
-    assert_eq!((&streamed["requests"], &streamed["round_trips"]), (&2.into(), &2.into()), "the scene and the stream");
+    assert_eq!(
+        (&streamed["requests"], &streamed["round_trips"]),
+        (&2.into(), &2.into()),
+        "the scene and the stream"
+    );
     assert!(usual["round_trips"].as_u64() > Some(2));
     // A stream costs no more than what it replaces, but for the rounding of what is in view.
     let bytes = |report: &serde_json::Value| report["bytes"].as_f64().unwrap();
