@@ -253,13 +253,20 @@ fn a_stream_is_immutable_however_it_is_asked_for_and_holds_what_single_requests_
     let site = site();
     block(async {
         let route = |query: &str| site.url(&format!("/scenes/world/{}/terrain/stream?{query}", site.version));
-        let ask = StreamAsk { error: 5.0, bbox: Some([0.0, 0.0, 9000.0, 4000.0]), ..StreamAsk::default() };
+        let [x, y] = site.layer.origin;
+        let bbox = [x, y, x + 9000.0, y + 4000.0];
+        let ask = StreamAsk { error: 0.5, bbox: Some(bbox), ..StreamAsk::default() };
         let answer = get(&site.url(&message::stream_route("world", &site.version, "terrain", &ask))).await;
         assert_eq!((answer.status.as_u16(), answer.header(&CACHE_CONTROL)), (200, IMMUTABLE));
         assert_eq!(answer.header(&CONTENT_TYPE), "application/octet-stream");
         let tag = answer.header(&ETAG).to_owned();
         // Another order of parameters, percent signs and more digits ask for the same.
-        for same in ["bbox=0,0,9e3,4000&error=5", "error=5.00&bbox=0%2C0%2C9000%2C4000"] {
+        let [x0, y0, x1, y1] = bbox;
+        let same = [
+            format!("bbox={x0:e},{y0},{x1:.3},{y1}&error=5e-1"),
+            format!("error=0.50&bbox={x0}%2C{y0}%2C{x1}%2C{y1}"),
+        ];
+        for same in &same {
             let again = get(&route(same)).await;
             assert_eq!((again.header(&ETAG), &again.body), (tag.as_str(), &answer.body), "{same}");
             let known = self::ask(Method::GET, &route(same), &[(IF_NONE_MATCH, &tag)]).await;
@@ -288,7 +295,7 @@ fn a_stream_is_immutable_however_it_is_asked_for_and_holds_what_single_requests_
         }
         println!("{} bytes: {seen} of {} diamonds, {pages} pages", answer.body.len(), site.diamonds.len());
         assert!(rest.is_empty() && pages > 0 && seen > 10 && seen < site.diamonds.len());
-        let limited = get(&route("limit=20000&error=5&bbox=0,0,9000,4000")).await;
+        let limited = get(&route(&format!("limit=20000&{}", same[0]))).await;
         assert!(limited.body.len() >= 20_000 && answer.body.starts_with(&limited.body));
         assert!(limited.body.len() < answer.body.len());
     });

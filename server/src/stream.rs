@@ -10,7 +10,7 @@
 //! region has a parent that does, and is found.
 //!
 //! Nothing is made before somebody reads it. What is remembered: the diamonds sent, those in the heap and the
-//! numbers of the pages, some 150 bytes for each diamond sent, and [`PAGES_HELD`] decoded pages, 1 MB.
+//! numbers of the pages, some 150 bytes for each diamond sent, and [`PAGES_HELD`] decoded pages, 2 MB.
 
 use crate::inspect::{InspectError, read_page};
 use crate::store::{Key, Kind, Store};
@@ -24,7 +24,7 @@ use std::collections::{BinaryHeap, HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 
 /// Decoded pages that a stream keeps at hand: some 30 kB each.
-pub const PAGES_HELD: usize = 32;
+pub const PAGES_HELD: usize = 64;
 
 /// What a frame holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -140,7 +140,7 @@ impl Stream {
         if let Some(d) = self.due.pop_front() {
             return Ok(Some(d));
         }
-        while let Some(root) = self.roots.next() {
+        for root in self.roots.by_ref() {
             if !self.pages.entry(root)?.is_empty() {
                 return Ok(Some(root));
             }

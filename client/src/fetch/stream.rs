@@ -124,7 +124,7 @@ mod tests {
         Ledger { forest: world()[0].layer.forest, diamonds, pages }
     }
 
-    fn is_unasked(entered: Result<Entered, FetchError>) -> bool {
+    fn is_unasked(entered: &Result<Entered, FetchError>) -> bool {
         matches!(entered, Err(FetchError::Unasked(_)))
     }
 
@@ -135,13 +135,13 @@ mod tests {
         let roots: Vec<Diamond> = forest.root_diamonds().collect();
         let child = forest.children(roots[0]).into_iter().flatten().find(|c| forest.parents(*c).count() == 2);
         let frame = |d: Diamond| FrameHeader::of(d.centre(), b"x");
-        assert!(is_unasked(ledger.enter(&FrameHeader::of([1, 3], b"x"), b"x")), "no diamond of the forest");
-        assert!(is_unasked(ledger.enter(&frame(child.unwrap()), b"x")), "no parent is there");
+        assert!(is_unasked(&ledger.enter(&FrameHeader::of([1, 3], b"x"), b"x")), "no diamond of the forest");
+        assert!(is_unasked(&ledger.enter(&frame(child.unwrap()), b"x")), "no parent is there");
         assert!(matches!(ledger.enter(&frame(roots[0]), b"x"), Ok(Entered::Diamond(d)) if d == roots[0]));
-        assert!(is_unasked(ledger.enter(&frame(child.unwrap()), b"x")), "one parent of two is there");
+        assert!(is_unasked(&ledger.enter(&frame(child.unwrap()), b"x")), "one parent of two is there");
         assert!(ledger.enter(&frame(roots[1]), b"x").is_ok());
         assert!(ledger.enter(&frame(child.unwrap()), b"x").is_ok());
-        assert!(is_unasked(ledger.enter(&frame(roots[1]), b"x")), "twice");
+        assert!(is_unasked(&ledger.enter(&frame(roots[1]), b"x")), "twice");
         let damaged = FrameHeader::of(child.unwrap().centre(), b"y");
         assert!(matches!(ledger.enter(&damaged, b"x"), Err(FetchError::Damaged(_))));
     }
@@ -157,7 +157,7 @@ mod tests {
         assert!(
             matches!(ledger.enter(&header, &blob), Ok(Entered::Page(0, list)) if list.len() == entries.len())
         );
-        assert!(is_unasked(ledger.enter(&header, &blob)));
+        assert!(is_unasked(&ledger.enter(&header, &blob)));
         let beyond = FrameHeader::of_page(u32::MAX, &blob);
         assert!(matches!(ledger.enter(&beyond, &blob), Err(FetchError::Page(_))));
         let bomb = zstd::bulk::compress(&vec![0u8; 64 << 20], 1).unwrap();
