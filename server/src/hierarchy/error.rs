@@ -1,0 +1,74 @@
+//! Why a scene could not be built: the file, what was expected, what was found and what to do.
+
+use crate::ingest::IngestError;
+use crate::store::StoreError;
+use diamantina_protocol::bintree::ForestError;
+use diamantina_protocol::points::{CodingError, SOURCE_MAX};
+use std::io;
+use std::path::PathBuf;
+
+/// Why a scene could not be built.
+#[derive(Debug, thiserror::Error)]
+pub enum BuildError {
+    /// The source could not be read.
+    #[error(transparent)]
+    Ingest(#[from] IngestError),
+    /// The store could not be written.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The working files could not be written.
+    #[error("{path}: cannot write the working files: {error}{}", if error.kind() == io::ErrorKind::StorageFull { "; free some space (16/3 bytes a sample) and build again" } else { "" })]
+    Work {
+        /// The work folder.
+        path: PathBuf,
+        /// What the system said.
+        error: io::Error,
+    },
+    /// No sample has a height.
+    #[error(
+        "the source has no data: all {0} samples are nodata; check its nodata value, or give another with --nodata"
+    )]
+    AllNodata(u64),
+    /// Heights do not fit in the integers of the format.
+    #[error("height {value} is {} quanta of {quantum} m, beyond {SOURCE_MAX}: give a larger --quantum", (value / quantum).round())]
+    Range {
+        /// Metres.
+        value: f64,
+        /// Metres of a quantum.
+        quantum: f64,
+    },
+    /// The quantum makes no sense.
+    #[error("--quantum {0}: expected metres above 0")]
+    Quantum(f64),
+    /// The asked error is out of range.
+    #[error("--max-error {asked}: expected 0 to {limit} m for a quantum of {quantum} m")]
+    MaxError {
+        /// Metres asked.
+        asked: f64,
+        /// The largest that can be coded.
+        limit: f64,
+        /// Metres of a quantum.
+        quantum: f64,
+    },
+    /// Too large, or too thin, for a forest.
+    #[error("the source has {width} x {height} samples: {error}")]
+    Forest {
+        /// Samples along x.
+        width: u32,
+        /// Samples along y.
+        height: u32,
+        /// Why not.
+        error: ForestError,
+    },
+    /// Our own steps were refused.
+    #[error("steps: {0}")]
+    Coding(#[from] CodingError),
+    /// The memory asked for is too little.
+    #[error("--memory {asked} bytes: this source needs at least {needed}")]
+    Memory {
+        /// Bytes asked.
+        asked: u64,
+        /// Bytes needed.
+        needed: u64,
+    },
+}
