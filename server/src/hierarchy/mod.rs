@@ -24,7 +24,7 @@ use crate::canvas::Canvas;
 use crate::ingest::{Grid, Source};
 use crate::progress::Progress;
 use crate::store::Writer;
-use coding::{exponents, fine_step};
+use coding::fine_step;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::message::{Crs, Frame, Kind, Scene};
 use diamantina_protocol::points::{Coding, Rule};
@@ -95,13 +95,11 @@ pub fn build(
     let forest = Forest::covering(grid.width, grid.height, options.patch_log2)
         .map_err(|error| BuildError::Forest { width: grid.width, height: grid.height, error })?;
     let writer = Writer::create(out)?;
-    let work = |error: io::Error| BuildError::Work { path: writer.work_folder().to_owned(), error };
     let plan = Plan::new(forest, options.memory)?;
 
     let (canvas, stats) = transcribe(source, &plan, options, writer.work_folder(), progress)?;
     let fine_step = fine_step(options.max_error, &stats)?;
-    let exponents = exponents(&plan, &canvas, fine_step).map_err(work)?;
-    let coding = Coding::new(options.rule, fine_step, exponents)?;
+    let coding = coding::coding(&plan, &canvas, options.rule, fine_step)?;
     let build = Build { plan, canvas, coding, writer: &writer, tallies: Mutex::default(), grid };
 
     let coarse = build.coarse_levels()?;
