@@ -130,7 +130,7 @@ impl Encoder {
 
 /// Takes symbols from bytes, which may be hostile: after their end it goes on with symbols of no meaning;
 /// ask [`Decoder::is_spent`] when all are read.
-#[derive(Debug)]
+#[derive(Debug, Clone, Copy)]
 pub struct Decoder<'a> {
     words: &'a [[u8; 2]],
     next: usize,

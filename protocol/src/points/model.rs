@@ -334,8 +334,8 @@ impl std::fmt::Debug for Tables {
 
 /// The class of a correction among all classes.
 #[must_use]
-pub fn correction_class(tilt: usize, roughness: usize) -> u8 {
-    (CLASSES + roughness * TILTS + tilt) as u8
+pub fn correction_class(tilt: u8, roughness: u8) -> u8 {
+    CLASSES as u8 + roughness * TILTS as u8 + tilt
 }
 
 impl Tables {
@@ -382,45 +382,54 @@ impl Tables {
     }
 
     fn decode_in<const LANES: usize>(&self, coder: &mut Decoder, classes: &[u8], numbers: &mut [i32]) {
-        let mut states = coder.states();
+        // A copy, so that states and place stay in registers.
+        let mut local = *coder;
+        let mut states = local.states();
         for (classes, numbers) in classes.chunks(LANES).zip(numbers.chunks_mut(LANES)) {
             for (lane, (class, number)) in classes.iter().zip(numbers).enumerate() {
                 let Some(table) = self.0.get(usize::from(*class)) else { continue };
                 let state = states[lane];
                 let slot = state % TOTAL;
-                let symbol = usize::from(table.symbol[slot as usize]);
-                let range = table.range[symbol & 63];
-                let state = (range & 0xffff)
-                    .wrapping_mul(state >> PRECISION)
-                    .wrapping_add(slot)
-                    .wrapping_sub(range >> 16);
-                states[lane] = coder.refill(state);
-                *number = symbol as i32 - ZERO as i32;
-                if symbol == ESCAPE || table.shift > 0 {
-                    (*number, states[lane]) = table.rest(coder, states[lane], symbol);
+                let symbol = table.symbol[slot as usize];
+                let range = table.range[usize::from(symbol & (SYMBOLS as u8 - 1))];
+                let (start, share) = (range >> 16, range & 0xffff);
+                let state = local.refill(share * (state >> PRECISION) + slot - start);
+                let bin = i32::from(symbol) - ZERO as i32;
+                if usize::from(symbol) == ESCAPE {
+                    (*number, states[lane], local) = table.escaped(local, state);
+                } else if table.shift > 0 {
+                    let (low, state) = local.plain_of(state, table.shift);
+                    (*number, states[lane]) = (table.whole(bin, low), state);
+                } else {
+                    (*number, states[lane]) = (bin, state);
                 }
             }
         }
-        coder.set_states(states);
+        local.set_states(states);
+        *coder = local;
     }
 }
 
 impl Table {
-    /// What follows a symbol in a table with plain bits, or an escape.
-    #[inline(never)]
-    fn rest(&self, coder: &mut Decoder, mut state: u32, symbol: usize) -> (i32, u32) {
-        let mut bin = symbol as i32 - ZERO as i32;
-        if symbol == ESCAPE {
-            let (kind, after) = coder.plain_of(state, LENGTH_BITS + 1);
-            // 26 bits are the most that an encoder writes.
-            let (excess, after) = plain_long_of(coder, after, (kind >> 1).min(26));
-            let magnitude = ((1 << (kind >> 1).min(26) | excess) + self.direct).cast_signed();
-            bin = if kind & 1 == 1 { -magnitude } else { magnitude };
-            state = after;
-        }
-        let (low, after) = plain_long_of(coder, state, self.shift);
+    /// The number of a bin and the low bits in it.
+    #[inline(always)]
+    fn whole(&self, bin: i32, low: u32) -> i32 {
         let half = (1 << self.shift) >> 1;
-        ((bin.wrapping_shl(self.shift) | low.cast_signed()).wrapping_sub(half), after)
+        (bin.wrapping_shl(self.shift) | low.cast_signed()).wrapping_sub(half)
+    }
+
+    /// The number behind an escape.
+    #[cold]
+    #[inline(never)]
+    fn escaped<'a>(&self, mut coder: Decoder<'a>, state: u32) -> (i32, u32, Decoder<'a>) {
+        let (kind, state) = coder.plain_of(state, LENGTH_BITS + 1);
+        // 26 bits are the most that an encoder writes.
+        let below = (kind >> 1).min(26);
+        let (excess, state) = plain_long_of(&mut coder, state, below);
+        let magnitude = ((1 << below | excess) + self.direct).cast_signed();
+        let bin = if kind & 1 == 1 { -magnitude } else { magnitude };
+        let (low, state) = plain_long_of(&mut coder, state, self.shift);
+        (self.whole(bin, low), state, coder)
     }
 }
 

@@ -15,6 +15,7 @@ use crate::bintree::Forest;
 use crate::diamond::{Block, Diamond, Local};
 use crate::rans::Context;
 use crate::{HEIGHT_MAX, NODATA};
+use std::ops::Range;
 
 /// The multiple of `step` nearest to `value`, in steps; `step` is odd, so nothing lies half way.
 pub(super) fn steps(value: i32, step: i32) -> i32 {
@@ -189,18 +190,37 @@ fn walk_corrections<P: Pass>(
     let finest = PLACES.map(|p| coding.exponent(level, p));
     let rounds = depths.into_iter().max().unwrap_or(0);
     let (old, _) = block.parts_mut();
+    let holes = rounds > 0 && old.contains(&NODATA);
     let mut thirds = Thirds::new(n);
     for round in (1..=rounds).rev() {
         for v in 1..n {
             thirds.clear();
-            for u in if upper { 1 } else { v }..n {
-                let slot = v * (n + 1) + u;
-                let at = PLACES.iter().position(|p| *p == place(n, 2 * u, 2 * v)).unwrap_or(0);
-                if depths[at] >= round && old[slot] != NODATA {
-                    // Of a diamond at the border what lies above the diagonal does not exist.
-                    let beside = [upper || u > v, upper || u > v];
-                    thirds.push(old, n, slot, beside, coding.step(finest[at] + round - 1));
+            // Between the diagonals all points are alike; those on them may be of another precision.
+            let (low, high) = (v.min(n - v), v.max(n - v));
+            let first = if upper { 1 } else { v };
+            let between = |thirds: &mut Thirds, from: usize, to: usize| {
+                let (from, to) = (from.max(first), to.min(n));
+                if depths[0] < round || from >= to {
+                    return;
                 }
+                let step = coding.step(finest[0] + round - 1);
+                let slots = v * (n + 1) + from..v * (n + 1) + to;
+                if holes || (!upper && from == v) {
+                    for slot in slots.filter(|s| old[*s] != NODATA) {
+                        thirds.push(old, n, slot, upper || slot % (n + 1) > v, step);
+                    }
+                } else {
+                    thirds.push_all(old, n, slots, step);
+                }
+            };
+            between(&mut thirds, 0, low);
+            for (i, u) in [low, high].into_iter().enumerate().take(if low == high { 1 } else { 2 }) {
+                let at = PLACES.iter().position(|p| *p == place(n, 2 * u, 2 * v)).unwrap_or(0);
+                let slot = v * (n + 1) + u;
+                if (first..n).contains(&u) && depths[at] >= round && old[slot] != NODATA {
+                    thirds.push(old, n, slot, upper || u > v, coding.step(finest[at] + round - 1));
+                }
+                between(&mut thirds, u + 1, if i == 0 && low < high { high } else { n });
             }
             thirds.pass(coding, pass, old, tally)?;
         }
@@ -208,47 +228,87 @@ fn walk_corrections<P: Pass>(
     Ok(())
 }
 
-/// A row's worth of corrections by a third.
+/// A row's worth of corrections by a third, in the order of the row.
 struct Thirds {
-    slots: Vec<(usize, i32, bool)>,
+    slots: Vec<usize>,
+    steps: Vec<i32>,
+    /// Whether the neighbours lie lower: towards them counts as up.
+    down: Vec<bool>,
     classes: Vec<u8>,
     numbers: Vec<i32>,
+}
+
+/// The class of a correction by `1 / per_step` of a point with these neighbours to the west, east, south
+/// and north; and whether they lie lower.
+#[inline(always)]
+fn third(here: i32, [w, e, s, n]: [i32; 4], per_step: f32) -> (u8, bool) {
+    // How far the neighbours' mean lies to one side, in parts of the three steps to choose from.
+    const TILT: [f32; TILTS - 1] = [0.06, 0.18, 0.35, 0.6, 1.2];
+    const ROUGH: [f32; ROUGHNESSES - 1] = [6.0, 18.0];
+    let tilt = w + e + s + n - 4 * here;
+    let aside = tilt.abs() as f32 * (per_step * (1.0 / 12.0));
+    let bends = (2 * (w + e - s - n).abs() + (w - e).abs() + (s - n).abs()) as f32 * (per_step * 0.25);
+    let tilted: u8 = TILT.iter().map(|limit| u8::from(aside >= *limit)).sum();
+    let rough: u8 = ROUGH.iter().map(|limit| u8::from(bends >= *limit)).sum();
+    (correction_class(tilted, rough), tilt < 0)
 }
 
 impl Thirds {
     fn new(n: usize) -> Self {
         let room = n + 1;
-        let (slots, classes) = (Vec::with_capacity(room), Vec::with_capacity(room));
-        Self { slots, classes, numbers: Vec::with_capacity(room) }
+        Self {
+            slots: Vec::with_capacity(room),
+            steps: Vec::with_capacity(room),
+            down: Vec::with_capacity(room),
+            classes: Vec::with_capacity(room),
+            numbers: Vec::with_capacity(room),
+        }
     }
 
     fn clear(&mut self) {
         self.slots.clear();
+        self.steps.clear();
+        self.down.clear();
         self.classes.clear();
     }
 
     /// Adds the old point at `slot`, to be moved by a `step` or not at all. `beside`: whether there are
     /// points to the west and to the north of it.
-    fn push(&mut self, old: &[i32], n: usize, slot: usize, [west, north]: [bool; 2], step: i32) {
+    fn push(&mut self, old: &[i32], n: usize, slot: usize, beside: bool, step: i32) {
         let here = old[slot];
         let known = |exists: bool, slot: usize| match old.get(slot) {
             Some(h) if exists && *h != NODATA => *h,
             _ => here,
         };
-        let (w, e) = (known(west, slot - 1), known(true, slot + 1));
-        let (s, n) = (known(true, slot - n - 1), known(north, slot + n + 1));
-        // How far the neighbours' mean lies to one side, in hundredths of what is being divided.
-        let tilt = w + e + s + n - 4 * here;
-        let wide = 12 * step.unsigned_abs();
-        let hundredths = (u64::from(tilt.unsigned_abs()) * 100 / u64::from(wide)).min(1000) as u32;
-        let bends =
-            (w + e - s - n).unsigned_abs() / 2 + ((w - e).unsigned_abs() + (s - n).unsigned_abs()) / 4;
-        const TILT: [u32; TILTS - 1] = [6, 18, 35, 60, 120];
-        const ROUGH: [u32; ROUGHNESSES - 1] = [6, 18];
-        let tilted = TILT.partition_point(|limit| hundredths >= *limit);
-        let rough = ROUGH.partition_point(|limit| bends >= *limit * step.unsigned_abs());
-        self.slots.push((slot, step, tilt < 0));
-        self.classes.push(correction_class(tilted, rough));
+        let near = [
+            known(beside, slot - 1),
+            known(true, slot + 1),
+            known(true, slot - n - 1),
+            known(beside, slot + n + 1),
+        ];
+        let (class, down) = third(here, near, 1.0 / step as f32);
+        self.slots.push(slot);
+        self.steps.push(step);
+        self.classes.push(class);
+        self.down.push(down);
+    }
+
+    /// Adds a run of old points whose neighbours all have heights.
+    fn push_all(&mut self, old: &[i32], n: usize, slots: Range<usize>, step: i32) {
+        let (from, count) = (slots.start, slots.len());
+        let per_step = 1.0 / step as f32;
+        let line = |at: usize| &old[at..at + count];
+        let (here, w, e) = (line(from), line(from - 1), line(from + 1));
+        let (s, north) = (line(from - n - 1), line(from + n + 1));
+        let start = self.classes.len();
+        self.slots.extend(slots);
+        self.steps.resize(start + count, step);
+        self.classes.resize(start + count, 0);
+        self.down.resize(start + count, false);
+        let (classes, down) = (&mut self.classes[start..][..count], &mut self.down[start..][..count]);
+        for u in 0..count {
+            (classes[u], down[u]) = third(here[u], [w[u], e[u], s[u], north[u]], per_step);
+        }
     }
 
     fn pass<P: Pass>(
@@ -262,11 +322,12 @@ impl Thirds {
         self.numbers.clear();
         self.numbers.resize(self.slots.len(), 0);
         pass.receive(tables, &self.classes, &mut self.numbers);
-        for ((slot, step, down), number) in self.slots.iter().zip(&mut self.numbers) {
+        let places = self.slots.iter().zip(&self.steps).zip(&self.down);
+        for (((slot, step), down), number) in places.zip(&mut self.numbers) {
             let base = old[*slot];
-            // Towards the neighbours counts as up.
             let turn = |k: i32| if *down { -k } else { k };
             *number = pass.number(*number, *slot, |h| turn(steps(h - base, *step).clamp(-1, 1)));
+            // Where numbers are damaged they are still small: tables of corrections have three symbols.
             old[*slot] = moved(base, turn(*number), *step)?;
             tally.corrected += u32::from(*number != 0);
         }
