@@ -180,6 +180,17 @@ fn rewritten(proj4: &str) -> String {
     words.collect::<Vec<_>>().join(" ")
 }
 
+/// Metres in one unit of height, where a PROJ string (of a compound CRS) says it.
+#[must_use]
+pub fn vertical_metres(proj4: &str) -> Option<f64> {
+    match parameter(proj4, "vunits")? {
+        "m" => Some(1.0),
+        "ft" => Some(0.3048),
+        "us-ft" => Some(1200.0 / 3937.0),
+        _ => None,
+    }
+}
+
 fn unit_metres(proj4: &str) -> f64 {
     let given = parameter(proj4, "to_meter").and_then(|v| match v.split_once('/') {
         Some((n, d)) => Some(n.parse::<f64>().ok()? / d.parse::<f64>().ok()?),

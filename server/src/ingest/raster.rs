@@ -147,6 +147,8 @@ pub(super) struct Raster {
     pub(super) integer: bool,
     pub(super) height_scale: f64,
     pub(super) height_offset: f64,
+    /// What the file says of its heights, where it is unclear how many metres a value is.
+    pub(super) height_doubt: Option<String>,
     pub(super) nodata: Option<f64>,
     pub(super) samples: Samples,
 }
