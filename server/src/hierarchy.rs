@@ -68,7 +68,7 @@ pub enum BuildError {
     #[error(transparent)]
     Store(#[from] StoreError),
     /// The working files could not be written.
-    #[error("{path}: cannot write the working files: {error}{}", if error.kind() == io::ErrorKind::StorageFull { "; free some space (16/3 bytes a sample) and build again" } else { "" })]
+    #[error("{path}: cannot write the working files: {error}; {}", if error.kind() == io::ErrorKind::StorageFull { "free some space (16/3 bytes a sample) and build again" } else { "check the disk, or choose another folder with -o" })]
     Work {
         /// The work folder.
         path: PathBuf,
@@ -81,7 +81,7 @@ pub enum BuildError {
     )]
     AllNodata(u64),
     /// Heights do not fit in the integers of the format.
-    #[error("height {value} is {} quanta of {quantum} m, beyond {SOURCE_MAX}: give a larger --quantum", (value / quantum).round())]
+    #[error("height {value} is {} quanta of {quantum} m, beyond {SOURCE_MAX}: if it stands for nodata, say --nodata; else give a larger --quantum", (value / quantum).round())]
     Range {
         /// Metres.
         value: f64,
@@ -89,7 +89,7 @@ pub enum BuildError {
         quantum: f64,
     },
     /// The quantum makes no sense.
-    #[error("--quantum {0}: expected metres above 0")]
+    #[error("--quantum {0}: expected metres above 0 and below {HEIGHT_METRES_MAX}")]
     Quantum(f64),
     /// The asked error is out of range.
     #[error("--max-error {asked}: expected 0 to {limit} m for a quantum of {quantum} m")]
@@ -102,7 +102,9 @@ pub enum BuildError {
         quantum: f64,
     },
     /// Too large, or too thin, for a forest.
-    #[error("the source has {width} x {height} samples: {error}")]
+    #[error(
+        "the source has {width} x {height} samples: {error}; cut it into pieces and build a store of each"
+    )]
     Forest {
         /// Samples along x.
         width: u32,
@@ -115,13 +117,18 @@ pub enum BuildError {
     #[error("steps: {0}")]
     Coding(#[from] CodingError),
     /// The memory asked for is too little.
-    #[error("--memory {asked} bytes: this source needs at least {needed}")]
+    #[error("--memory {}: too little for this source: say --memory {} or more", mebibytes(*asked), mebibytes(*needed))]
     Memory {
         /// Bytes asked.
         asked: u64,
         /// Bytes needed.
         needed: u64,
     },
+}
+
+/// Bytes as the command line takes them, rounded up.
+fn mebibytes(bytes: u64) -> String {
+    format!("{}MiB", bytes.div_ceil(1 << 20))
 }
 
 /// What a build did.
@@ -228,22 +235,26 @@ impl Plan {
         let [w, h] = forest.size().map(u64::from);
         let threads = rayon::current_num_threads() as u64;
         // Chunks of 1024 cells, or larger where the coarse levels would otherwise not fit.
-        let mut chunk_log2 = 10.max(forest.patch_log2() + 2).min(forest.root_log2());
+        let chunk_logs = 10.max(forest.patch_log2() + 2).min(forest.root_log2())..=forest.root_log2();
         let coarse_bytes = |chunk_log2: u32| {
             let spacing = chunk_log2 - forest.patch_log2();
             // Heights of all coarse levels, and the blocks of the last three: about 40 bytes a point.
             ((w >> spacing) + 1) * ((h >> spacing) + 1) * 40
         };
-        while coarse_bytes(chunk_log2) > memory / 4 && chunk_log2 < forest.root_log2() {
-            chunk_log2 += 1;
-        }
         // A chunk's windows, blocks and surfaces: measured at about 40 bytes a cell, halo included.
-        let chunk_bytes = 40u64 << (2 * chunk_log2);
+        let chunk_bytes = |chunk_log2: u32| 40u64 << (2 * chunk_log2);
         let base = 96 << 20;
-        let needed = base + coarse_bytes(chunk_log2) + chunk_bytes;
-        if needed > memory {
-            return Err(BuildError::Memory { asked: memory, needed });
-        }
+        let needed = |chunk_log2: u32| {
+            // The coarse levels should take no more than a quarter, where larger chunks could still help.
+            let share = if chunk_log2 < forest.root_log2() { 4 } else { 1 };
+            let coarse = coarse_bytes(chunk_log2);
+            (base + coarse + chunk_bytes(chunk_log2)).max(share * coarse)
+        };
+        let Some(chunk_log2) = chunk_logs.clone().find(|log2| needed(*log2) <= memory) else {
+            let least = chunk_logs.map(needed).min().unwrap_or(u64::MAX);
+            return Err(BuildError::Memory { asked: memory, needed: least });
+        };
+        let chunk_bytes = chunk_bytes(chunk_log2);
         let workers = ((memory - base - coarse_bytes(chunk_log2)) / 2 / chunk_bytes).clamp(1, threads);
         let chunks = Chunks::new(forest, chunk_log2);
         Ok(Self { forest, chunks, band_bytes: memory / 8 / threads, workers: workers as usize })
@@ -268,6 +279,9 @@ struct Stats {
     rounding: f64,
 }
 
+/// Heights are below this, in metres: a client refuses what is more.
+const HEIGHT_METRES_MAX: f64 = 1e12;
+
 /// The greatest power of ten at or below `value`.
 fn power_of_ten(value: f64) -> f64 {
     let exponent = value.log10().floor() as i32;
@@ -281,7 +295,7 @@ fn find_quantum(source: &Source, options: &Options) -> Result<f64, BuildError> {
     let grid = source.grid();
     let scale = grid.height_scale.abs();
     if let Some(quantum) = options.quantum {
-        return if quantum > 0.0 && quantum.is_finite() {
+        return if quantum > 0.0 && quantum < HEIGHT_METRES_MAX {
             Ok(quantum)
         } else {
             Err(BuildError::Quantum(quantum))
@@ -319,7 +333,22 @@ fn find_quantum(source: &Source, options: &Options) -> Result<f64, BuildError> {
         Some(step) if options.max_error == 0.0 || step <= options.max_error => step,
         _ => fine.max(asked),
     };
-    Ok(quantum.max(power_of_ten(largest / f64::from(SOURCE_MAX)) * 10.0))
+    let least = power_of_ten(largest / f64::from(SOURCE_MAX)) * 10.0;
+    if least > quantum && (largest >= HEIGHT_METRES_MAX || is_outlier(&mut heights, least)) {
+        let value = if low.abs() > high.abs() { low } else { high };
+        return Err(BuildError::Range { value, quantum });
+    }
+    Ok(quantum.max(least))
+}
+
+/// Whether a quantum that is due to the largest height is too coarse for the heights without their extremes:
+/// then these are no heights, but nodata that nobody declared.
+fn is_outlier(heights: &mut Vec<f64>, quantum: f64) -> bool {
+    heights.sort_by(f64::total_cmp);
+    heights.dedup();
+    let aside = (heights.len() / 100).max(1);
+    let rest = heights.get(aside..heights.len().saturating_sub(aside)).unwrap_or_default();
+    rest.first().zip(rest.last()).is_some_and(|(low, high)| high - low < 256.0 * quantum)
 }
 
 /// Reads the whole source into a canvas of quanta.
