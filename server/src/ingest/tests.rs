@@ -300,6 +300,20 @@ fn a_vertical_crs_tells_the_unit_of_heights() {
     }
 }
 
+/// Feet became metres where the projection itself is not built in.
+#[test]
+fn units_of_projections_that_are_not_built_in_are_known() {
+    let folder = folder();
+    // Oblique Mercator (Oregon) in feet, Cassini (Trinidad) in Clarke's links.
+    for (code, metres) in [(6809, 0.3048), (2066, 0.201_166_195_164)] {
+        assert!(crate::projection::Projection::new(crate::projection::epsg(code.into()).unwrap()).is_err());
+        let tags = Tags::new(&[[1024, 0, 1, 1], [1025, 0, 1, 2], [3072, 0, 1, code]]);
+        let path = put(&folder, "a.tif", &tiff!(colortype::GrayI16, 4, 3, [1i16; 12], &tags));
+        let grid = open(&[path], &Options::default()).unwrap().grid().clone();
+        assert!((grid.cell[0] - 30.0 * metres).abs() < 1e-9, "{code}: {:?}", grid.cell);
+    }
+}
+
 #[test]
 fn units_go_by_many_names() {
     for (text, metres) in [
