@@ -99,6 +99,10 @@ impl Keys {
         }
         match counts {
             Some((_, Some(Vertical::Heights(metres)))) => return Some(Ok(metres)),
+            // GDAL writes a geographic system with heights above the ellipsoid here: they are in metres.
+            Some((code, _)) if projection::epsg(code).is_some_and(|text| text.contains("+proj=longlat")) => {
+                return Some(Ok(1.0));
+            }
             Some((code, _)) => {
                 return Some(Err(format!("heights in vertical CRS EPSG:{code}, whose unit is not known")));
             }
