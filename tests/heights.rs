@@ -61,7 +61,8 @@ impl Asked<'_> {
         }
         if east && north {
             // Diagonals alternate like a chessboard's colours.
-            let diagonal = if (x + y) % 2 == 0 { [[x, y], [x + 1, y + 1]] } else { [[x + 1, y], [x, y + 1]] };
+            let diagonal =
+                if (x + y).is_multiple_of(2) { [[x, y], [x + 1, y + 1]] } else { [[x + 1, y], [x, y + 1]] };
             self.compare([fx + 0.5, fy + 0.5], diagonal);
             self.somewhere(x, y);
         }
