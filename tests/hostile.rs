@@ -224,21 +224,6 @@ fn a_wrong_build_says_what_is_wrong_and_what_to_do() {
     );
 }
 
-#[test]
-fn the_memory_that_an_error_names_is_enough_and_less_is_not() {
-    let scratch = tempfile::tempdir().unwrap();
-    let folder = scratch.path();
-    sample::write(&folder.join("dem.tif"), 513).unwrap();
-    let build = |memory: &str| server(folder, &format!("build {{}}/dem.tif -o {{}}/store --memory {memory}"));
-    let refused = build("3MiB");
-    assert_failed(&refused, 2, &["--memory 3MiB", "say --memory "], "little memory");
-    let named = refused.err.rsplit_once("--memory ").unwrap().1.split_whitespace().next().unwrap();
-    let enough: u64 = named.strip_suffix("MiB").unwrap().parse().unwrap();
-    assert_failed(&build(&format!("{}MiB", enough - 1)), 2, &[named], "a little less");
-    let ended = build(named);
-    assert_eq!(ended.code, Some(0), "{named}: {ended:?}");
-}
-
 /// `| head` made of a build that had succeeded one that had failed.
 #[test]
 fn a_reader_that_has_seen_enough_is_no_failure() {

@@ -290,7 +290,7 @@ fn a_vertical_crs_tells_the_unit_of_heights() {
     for (keys, word) in [
         ([[4096, 0, 1, 5715], [4099, 0, 1, 9001]], "depths, which grow downwards"),
         ([[4096, 0, 1, 6358], [1025, 0, 1, 2]], "EPSG:6358"),
-        ([[4096, 0, 1, 4711], [1025, 0, 1, 2]], "EPSG:4711, whose unit is not known"),
+        ([[4096, 0, 1, 12_345], [1025, 0, 1, 2]], "EPSG:12345, whose unit is not known"),
         ([[4099, 0, 1, 9999], [1025, 0, 1, 2]], "unit EPSG:9999"),
     ] {
         let message = open_with(&keys, &Options::default()).unwrap_err().to_string();
