@@ -9,6 +9,8 @@
 
 /// The same input gives the same bytes, whatever the threads and the memory.
 mod determinism;
+/// Heights asked for: every sample, and places between.
+mod heights;
 /// Wrong uses, broken files and sudden ends, through the real programs: exit codes, words, what survives.
 mod hostile;
 /// What the server answers to whom: routes, caches, refusals, heights.

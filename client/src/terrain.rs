@@ -45,6 +45,8 @@ pub const ENCODING: &str = "points";
 pub struct Options {
     /// The error to reach, in pixels.
     pub tolerance_pixels: f64,
+    /// What heights are multiplied by, and errors with them.
+    pub exaggeration: f64,
     /// Memory for surfaces, in bytes. What the cut wants takes at most three quarters of it: where that is
     /// too little for the tolerance, the largest errors are reduced first.
     pub memory_bytes: usize,
@@ -58,6 +60,7 @@ impl Default for Options {
     fn default() -> Self {
         Self {
             tolerance_pixels: 1.0,
+            exaggeration: 1.0,
             memory_bytes: 512 << 20,
             encoding: ENCODING.to_owned(),
             fetch: fetch::Options::default(),
@@ -88,7 +91,9 @@ pub enum TerrainError {
     #[error("tolerance of {0} pixels: expected a number above 0")]
     Tolerance(f64),
     /// No threads.
-    #[error("cannot start a decoding thread: {0}")]
+    #[error(
+        "cannot start a decoding thread: {0}: close other programs, or raise the limit on threads (ulimit -u)"
+    )]
     Thread(#[from] std::io::Error),
 }
 
@@ -131,7 +136,8 @@ pub struct FrameView {
     /// The triangles to draw; together they cover whatever of the scene is in view, once all roots are
     /// there.
     pub items: Vec<DrawItem>,
-    /// The largest declared error of what is drawn, in pixels; infinite while a layer lacks a root.
+    /// The largest declared error of what is drawn, in pixels, as it looks from no nearer than the near plane;
+    /// infinite while a layer lacks a root.
     pub error_pixels: f64,
     /// The same, once all that the ideal cut wants has arrived, as far as the index tells already.
     pub error_pixels_goal: f64,
@@ -250,8 +256,16 @@ impl Terrain {
         }
     }
 
-    /// Takes in what has arrived, says what to draw, and asks for what is missing. Never waits; takes
-    /// about a microsecond for each diamond that the cut looks at.
+    /// Sets what heights are multiplied by; what is no number above 0 changes nothing.
+    pub fn set_exaggeration(&mut self, exaggeration: f64) {
+        if exaggeration > 0.0 && exaggeration.is_finite() {
+            self.options.exaggeration = exaggeration;
+        }
+    }
+
+    /// Takes in what has arrived, says what to draw, and asks for what is missing. The camera's heights are
+    /// multiplied, if those of the terrain are. Never waits; takes about a microsecond for each diamond that
+    /// the cut looks at.
     pub fn frame(&mut self, camera: &Camera) -> FrameView {
         let started = Instant::now();
         self.take_decoded();
@@ -263,6 +277,7 @@ impl Terrain {
             let ask = Ask {
                 layer: &self.scene.layers[number],
                 camera,
+                exaggeration: self.options.exaggeration,
                 tolerance_pixels: self.options.tolerance_pixels,
                 splits_max: state.splits_max,
             };

@@ -7,7 +7,7 @@ use diamantina_server::hierarchy::{self, BuildError, Report};
 use diamantina_server::ingest::IngestError;
 use diamantina_server::inspect::{self, Inspection};
 use diamantina_server::progress::Progress;
-use diamantina_server::store::Store;
+use diamantina_server::store::{Store, StoreError};
 use diamantina_server::{demo, http, ingest};
 use std::io::Write;
 use std::net::SocketAddr;
@@ -38,7 +38,8 @@ enum Command {
 
 #[derive(Args)]
 struct BuildArgs {
-    /// DEM files of one layer: GeoTIFF, .hgt, Arc ASCII, USGS DEM, PNG, raw; .gz and .zip of these
+    /// DEM files of one layer: GeoTIFF, .hgt, Arc ASCII, USGS DEM or PNG, also in a .gz, or alone in a .zip; raw,
+    /// also in a .gz
     #[arg(required = true, value_name = "DEM")]
     sources: Vec<PathBuf>,
     /// The folder of the store; an older scene in it is replaced once the new one is complete
@@ -51,8 +52,8 @@ struct BuildArgs {
     #[arg(long, default_value = "2GiB", value_name = "BYTES", value_parser = parse_bytes)]
     memory: u64,
     /// Threads [default: one a core]
-    #[arg(long, value_name = "N")]
-    threads: Option<usize>,
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
     /// Encodings to build
     #[arg(long, default_value = "points", value_enum, value_delimiter = ',')]
     encoding: Vec<Encoding>,
@@ -159,6 +160,14 @@ impl<E: std::error::Error> From<E> for Failure {
     }
 }
 
+/// What became of printing results. That nobody reads any more, as behind `| head`, is no failure.
+fn shown(printed: std::io::Result<()>) -> std::io::Result<()> {
+    match printed {
+        Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        other => other,
+    }
+}
+
 fn main() -> ExitCode {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| "warn".into());
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
@@ -197,15 +206,26 @@ fn scene_name(given: Option<String>, store: &Path) -> Result<String, Failure> {
     let fit: String = folder
         .chars()
         .map(|c| if c.is_ascii_alphanumeric() || "._-".contains(c) { c } else { '-' })
-        .take(64)
         .collect();
     let fit = fit.trim_start_matches('.').to_owned();
-    Ok(if fit.is_empty() { "scene".to_owned() } else { fit })
+    match fit.as_str() {
+        "" => Ok("scene".to_owned()),
+        name if is_name(name) => Ok(fit),
+        name => Err(Failure(
+            2,
+            format!(
+                "{}: expected a folder whose name can be the scene's, at most 64 characters, found {}: \
+                 name the scene with --scene NAME",
+                store.display(),
+                name.len()
+            ),
+        )),
+    }
 }
 
 fn build(args: BuildArgs) -> Result<(), Failure> {
     if let Some(threads) = args.threads {
-        rayon::ThreadPoolBuilder::new().num_threads(threads).build_global()?;
+        rayon::ThreadPoolBuilder::new().num_threads(threads.into()).build_global()?;
     }
     let options = hierarchy::Options {
         scene: scene_name(args.scene, &args.output)?,
@@ -229,9 +249,9 @@ fn build(args: BuildArgs) -> Result<(), Failure> {
         .map_err(|e| refuse_build(&args.sources, &e))?;
     let mut out = std::io::stdout().lock();
     if args.json {
-        writeln!(out, "{}", serde_json::to_string_pretty(&report)?)?;
+        shown(writeln!(out, "{}", serde_json::to_string_pretty(&report)?))?;
     } else {
-        print_report(&mut out, &args.output, &report)?;
+        shown(print_report(&mut out, &args.output, &report))?;
     }
     Ok(())
 }
@@ -243,6 +263,7 @@ fn refuse_build(sources: &[PathBuf], error: &BuildError) -> Failure {
         BuildError::MaxError { .. }
             | BuildError::Quantum(_)
             | BuildError::Memory { .. }
+            | BuildError::Store(StoreError::Foreign { .. })
             | BuildError::Ingest(IngestError::Options { .. })
     );
     // What the heights themselves are to blame for names where they came from.
@@ -279,8 +300,8 @@ fn print_report(out: &mut impl Write, store: &Path, report: &Report) -> std::io:
 fn serve(stores: &[PathBuf], listen: SocketAddr) -> Result<(), Failure> {
     let server = http::Server::open(stores, listen)?;
     let mut out = std::io::stdout().lock();
-    writeln!(out, "Serving {} at {}", server.scenes().join(", "), server.address())?;
-    out.flush()?;
+    let printed = writeln!(out, "Serving {} at {}", server.scenes().join(", "), server.address());
+    shown(printed.and_then(|()| out.flush()))?;
     drop(out);
     Ok(server.run_until_signal()?)
 }
@@ -290,9 +311,9 @@ fn inspect_store(args: &InspectArgs) -> Result<(), Failure> {
     let inspection = inspect::inspect(&store, args.verify)?;
     let mut out = std::io::stdout().lock();
     if args.json {
-        writeln!(out, "{}", serde_json::to_string_pretty(&inspection)?)?;
+        shown(writeln!(out, "{}", serde_json::to_string_pretty(&inspection)?))?;
     } else {
-        print_inspection(&mut out, &inspection)?;
+        shown(print_inspection(&mut out, &inspection))?;
     }
     Ok(())
 }

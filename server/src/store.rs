@@ -52,6 +52,7 @@ const MAGIC: &[u8; 8] = b"DMTDIR01";
 const ENTRY_BYTES: usize = 32;
 const SCENE_FILE: &str = "scene.json";
 const WORK_FOLDER: &str = ".building";
+const LOCK_FILE: &str = ".lock";
 
 /// The name of a blob.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -79,7 +80,7 @@ pub enum Kind {
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     /// The file system said no.
-    #[error("{path}: cannot {action}: {error}{}", remedy(error))]
+    #[error("{path}: cannot {action}: {error}; {}", remedy(action, error))]
     Io {
         /// What was being done.
         action: &'static str,
@@ -96,6 +97,16 @@ pub enum StoreError {
     /// Another build holds the lock.
     #[error("{0}: another build is writing this store: wait for it, or choose another folder with -o")]
     Busy(PathBuf),
+    /// The folder holds what no build left there.
+    #[error(
+        "{path}: expected an empty folder or a store, found '{found}' in it: choose another folder with -o"
+    )]
+    Foreign {
+        /// The folder.
+        path: PathBuf,
+        /// The first of what is in it.
+        found: String,
+    },
     /// Written by another version.
     #[error("{path}: store has format {found}, this program reads {FORMAT}: build it again")]
     Format {
@@ -114,15 +125,41 @@ pub enum StoreError {
     },
 }
 
-fn remedy(error: &io::Error) -> &'static str {
+fn remedy(action: &str, error: &io::Error) -> &'static str {
     match error.kind() {
         io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
-            "; free some space and build again (the old scene, if any, is untouched)"
+            "free some space and build again (the old scene, if any, is untouched)"
         }
-        io::ErrorKind::PermissionDenied => "; choose a folder that you may write to",
-        io::ErrorKind::ReadOnlyFilesystem => "; choose a folder on a disk that can be written",
-        _ => "",
+        io::ErrorKind::ReadOnlyFilesystem => "choose a folder on a disk that can be written",
+        kind if matches!(action, "open" | "read") => match kind {
+            io::ErrorKind::PermissionDenied => "ask for the right to read it",
+            _ => "build the store again, or copy it again from where it is intact",
+        },
+        io::ErrorKind::PermissionDenied => "choose a folder that you may write to",
+        _ => "check the disk, or choose another folder with -o (the old scene, if any, is untouched)",
     }
+}
+
+/// The first thing in a folder that neither a build nor the making of a file system left there, unless the
+/// folder is a store already.
+fn foreign(root: &Path) -> Option<String> {
+    // What cannot be looked into cannot be made a store either: that is said when it is tried.
+    let names =
+        fs::read_dir(root).ok()?.filter_map(|e| Some(e.ok()?.file_name().to_string_lossy().into_owned()));
+    let mut names: Vec<String> = names.collect();
+    names.sort();
+    // A store is one whatever else its owner keeps in it.
+    if matches!(Manifest::read(root), Ok(_) | Err(StoreError::Format { .. })) {
+        return None;
+    }
+    let built_here = names.iter().any(|name| name == LOCK_FILE);
+    let is_version = |name: &str| name.len() == 16 && name.bytes().all(|b| b.is_ascii_hexdigit());
+    names.into_iter().find(|name| match name.as_str() {
+        LOCK_FILE | WORK_FOLDER | "lost+found" => false,
+        // A damaged description, and versions whose build was killed before it was there.
+        SCENE_FILE => !built_here,
+        other => !(built_here && is_version(other)),
+    })
 }
 
 fn io_at<'a>(action: &'static str, path: &'a Path) -> impl Fn(io::Error) -> StoreError + 'a {
@@ -242,8 +279,11 @@ impl Writer {
     /// # Errors
     /// When another build is at work there or the folder cannot be written.
     pub fn create(root: &Path) -> Result<Self, StoreError> {
+        if let Some(found) = foreign(root) {
+            return Err(StoreError::Foreign { path: root.to_owned(), found });
+        }
         fs::create_dir_all(root).map_err(io_at("create the folder", root))?;
-        let lock_path = root.join(".lock");
+        let lock_path = root.join(LOCK_FILE);
         let lock = File::options()
             .create(true)
             .append(true)

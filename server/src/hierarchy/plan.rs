@@ -21,22 +21,26 @@ impl Plan {
         let [w, h] = forest.size().map(u64::from);
         let threads = rayon::current_num_threads() as u64;
         // Chunks of 1024 cells, or larger where the coarse levels would otherwise not fit.
-        let mut chunk_log2 = 10.max(forest.patch_log2() + 2).min(forest.root_log2());
+        let chunk_logs = 10.max(forest.patch_log2() + 2).min(forest.root_log2())..=forest.root_log2();
         let coarse_bytes = |chunk_log2: u32| {
             let spacing = chunk_log2 - forest.patch_log2();
             // Heights of all coarse levels, and the blocks of the last three: about 40 bytes a point.
             ((w >> spacing) + 1) * ((h >> spacing) + 1) * 40
         };
-        while coarse_bytes(chunk_log2) > memory / 4 && chunk_log2 < forest.root_log2() {
-            chunk_log2 += 1;
-        }
         // A chunk's windows, blocks and surfaces: measured at about 40 bytes a cell, halo included.
-        let chunk_bytes = 40u64 << (2 * chunk_log2);
+        let chunk_bytes = |chunk_log2: u32| 40u64 << (2 * chunk_log2);
         let base = 96 << 20;
-        let needed = base + coarse_bytes(chunk_log2) + chunk_bytes;
-        if needed > memory {
-            return Err(BuildError::Memory { asked: memory, needed });
-        }
+        let needed = |chunk_log2: u32| {
+            // The coarse levels should take no more than a quarter, where larger chunks could still help.
+            let share = if chunk_log2 < forest.root_log2() { 4 } else { 1 };
+            let coarse = coarse_bytes(chunk_log2);
+            (base + coarse + chunk_bytes(chunk_log2)).max(share * coarse)
+        };
+        let Some(chunk_log2) = chunk_logs.clone().find(|log2| needed(*log2) <= memory) else {
+            let least = chunk_logs.map(needed).min().unwrap_or(u64::MAX);
+            return Err(BuildError::Memory { asked: memory, needed: least });
+        };
+        let chunk_bytes = chunk_bytes(chunk_log2);
         let workers = ((memory - base - coarse_bytes(chunk_log2)) / 2 / chunk_bytes).clamp(1, threads);
         let chunks = Chunks::new(forest, chunk_log2);
         Ok(Self { forest, chunks, band_bytes: memory / 8 / threads, workers: workers as usize })
