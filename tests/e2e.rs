@@ -15,6 +15,8 @@ mod heights;
 mod hostile;
 /// What the server answers to whom: routes, caches, refusals, heights.
 mod http;
+/// Progressive streams: what any prefix is worth, who may ask for what, and the client that draws from one.
+mod progressive;
 /// Law 2: any cut of a built store, with anything missing, has no cracks.
 mod seams;
 /// Streaming from end to end: pictures, bytes, flights with late data.

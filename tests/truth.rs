@@ -24,14 +24,14 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
 /// Every sample of a source in metres above its height offset; NaN is nodata.
-struct Samples {
-    width: u32,
-    height: u32,
+pub(crate) struct Samples {
+    pub(crate) width: u32,
+    pub(crate) height: u32,
     metres: Vec<f64>,
 }
 
 impl Samples {
-    fn read(source: &Source) -> Self {
+    pub(crate) fn read(source: &Source) -> Self {
         let grid = source.grid();
         let bands: Vec<u32> = (0..grid.height).step_by(256).collect();
         let metres = bands
@@ -46,7 +46,7 @@ impl Samples {
     }
 
     /// The sample at a lattice point; nodata beyond the source.
-    fn at(&self, x: i64, y: i64) -> f64 {
+    pub(crate) fn at(&self, x: i64, y: i64) -> f64 {
         if x >= i64::from(self.width) || y >= i64::from(self.height) {
             return f64::NAN;
         }
@@ -56,10 +56,10 @@ impl Samples {
 
 /// What one run found.
 #[derive(Default)]
-struct Verdict {
-    compared: AtomicU64,
-    wrong: AtomicU64,
-    examples: Mutex<Vec<String>>,
+pub(crate) struct Verdict {
+    pub(crate) compared: AtomicU64,
+    pub(crate) wrong: AtomicU64,
+    pub(crate) examples: Mutex<Vec<String>>,
 }
 
 impl Verdict {
@@ -81,17 +81,17 @@ struct Corner {
 }
 
 /// A layer with the samples it was made of.
-struct Check<'a> {
-    layer: &'a Layer,
-    forest: Forest,
-    samples: &'a Samples,
-    entries: &'a HashMap<Diamond, Entry>,
-    verdict: &'a Verdict,
+pub(crate) struct Check<'a> {
+    pub(crate) layer: &'a Layer,
+    pub(crate) forest: Forest,
+    pub(crate) samples: &'a Samples,
+    pub(crate) entries: &'a HashMap<Diamond, Entry>,
+    pub(crate) verdict: &'a Verdict,
 }
 
 impl Check<'_> {
     /// All that the split of a diamond draws: up to four triangles of the next level.
-    fn split(&self, d: Diamond, block: &Block) {
+    pub(crate) fn split(&self, d: Diamond, block: &Block) {
         let local = self.forest.local(d);
         let n = self.forest.segments() as i64;
         let children = self.forest.children(d);

@@ -91,10 +91,23 @@ fn around_box([low, high]: [DVec3; 2], size: [u32; 2], exaggeration: f64) -> Cam
     around(&(0..8).map(corner).collect::<Vec<_>>(), size, exaggeration)
 }
 
+/// Begins to stream what a picture from `camera` needs, in one request; [`picture`] (or [`framed`]) goes on from
+/// there. The camera's heights are stretched as there.
+pub fn stream(terrain: &mut Terrain, camera: &Camera, exaggeration: f64) {
+    terrain.set_exaggeration(exaggeration);
+    terrain.stream(&stretched(camera, exaggeration));
+}
+
+/// As [`overview`], of a scene whose heights are multiplied by `exaggeration` (but the camera's are not).
+#[must_use]
+pub fn stretched_overview(scene: &Scene, size: [u32; 2], exaggeration: f64) -> Camera {
+    around_box(extent(scene), size, exaggeration)
+}
+
 /// As [`overview`], but as near as the terrain itself allows, which may be less than its box: waits for a
 /// coarse form of it. Heights are multiplied by `exaggeration` to find the camera, but its own are not.
 pub fn framed(terrain: &mut Terrain, size: [u32; 2], exaggeration: f64, patience: Duration) -> Camera {
-    let camera = around_box(extent(terrain.scene()), size, exaggeration);
+    let camera = stretched_overview(terrain.scene(), size, exaggeration);
     let wide = stretched(&camera, exaggeration);
     terrain.set_exaggeration(exaggeration);
     let until = Instant::now() + patience;

@@ -99,6 +99,11 @@ struct RenderArgs {
     /// A point in the middle of the picture, in the frame's metres
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, requires = "eye", allow_hyphen_values = true)]
     target: Option<DVec3>,
+    /// Ask for the whole view in one request, the largest errors first: one round trip after the scene's
+    /// description. Without --eye it is asked for as seen from a little farther away than it is then drawn, and
+    /// more requests follow
+    #[arg(long)]
+    stream: bool,
     /// Seconds to wait for data before drawing what is there
     #[arg(long, default_value_t = 60.0, value_name = "SECONDS")]
     timeout: f64,
@@ -267,6 +272,7 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
     let patience = Duration::try_from_secs_f64(args.timeout)
         .map_err(|_| Failure(2, format!("--timeout {}: expected seconds, 0 or more", args.timeout)))?;
     let mut terrain = args.view.open()?;
+    let ViewArgs { size, exaggeration, .. } = args.view;
     let camera = match (args.eye, args.target) {
         (Some(eye), Some(target)) if eye == target => {
             return Err(Failure(
@@ -274,8 +280,20 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
                 "--eye and --target are the same point: there is no direction to look in".to_owned(),
             ));
         }
-        (Some(eye), Some(target)) => Camera { eye, target, fov_y: FOV_Y, size: args.view.size },
-        _ => headless::framed(&mut terrain, args.view.size, args.view.exaggeration, patience),
+        (Some(eye), Some(target)) => {
+            let camera = Camera { eye, target, fov_y: FOV_Y, size };
+            if args.stream {
+                headless::stream(&mut terrain, &camera, exaggeration);
+            }
+            camera
+        }
+        _ => {
+            if args.stream {
+                let wide = headless::stretched_overview(terrain.scene(), size, exaggeration);
+                headless::stream(&mut terrain, &wide, exaggeration);
+            }
+            headless::framed(&mut terrain, size, exaggeration, patience)
+        }
     };
     let look = args.view.look(terrain.scene());
     let (picture, report) = headless::picture(&mut terrain, &camera, &look, &args.view.options(), patience)?;

@@ -8,11 +8,12 @@ use diamantina_server::ingest::IngestError;
 use diamantina_server::inspect::{self, Inspection};
 use diamantina_server::progress::Progress;
 use diamantina_server::store::{Store, StoreError};
-use diamantina_server::{demo, http, ingest};
+use diamantina_server::{curve, demo, http, ingest};
 use std::io::Write;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::Arc;
 
 /// Builds and serves streamed terrain.
 #[derive(Parser)]
@@ -107,6 +108,10 @@ struct InspectArgs {
     /// Read, check and decode every blob
     #[arg(long)]
     verify: bool,
+    /// Write, for each prefix of each layer's progressive stream, its bytes and its declared and true errors
+    /// here (- for standard output, and nothing else)
+    #[arg(long, value_name = "CSV")]
+    curve: Option<PathBuf>,
 }
 
 #[derive(Args)]
@@ -307,9 +312,17 @@ fn serve(stores: &[PathBuf], listen: SocketAddr) -> Result<(), Failure> {
 }
 
 fn inspect_store(args: &InspectArgs) -> Result<(), Failure> {
-    let store = Store::open(&args.store)?;
+    let store = Arc::new(Store::open(&args.store)?);
     let inspection = inspect::inspect(&store, args.verify)?;
     let mut out = std::io::stdout().lock();
+    if let Some(path) = &args.curve {
+        if path.as_os_str() == "-" {
+            return Ok(curve::write(&store, &mut out)??);
+        }
+        let unwritten = |e: std::io::Error| Failure(1, format!("{}: cannot write: {e}", path.display()));
+        let mut file = std::fs::File::create(path).map_err(unwritten)?;
+        curve::write(&store, &mut file)?.map_err(unwritten)?;
+    }
     if args.json {
         shown(writeln!(out, "{}", serde_json::to_string_pretty(&inspection)?))?;
     } else {

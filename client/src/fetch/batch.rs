@@ -55,6 +55,11 @@ impl Frames {
         self.buffer.extend_from_slice(chunk);
     }
 
+    /// Whether all bytes so far belonged to frames that have been taken.
+    pub(super) fn is_empty(&self) -> bool {
+        self.buffer.is_empty() && self.header.is_none()
+    }
+
     /// The next frame, if all of it is there.
     pub(super) fn take(&mut self) -> Result<Option<(FrameHeader, Bytes)>, WireError> {
         if self.header.is_none()

@@ -15,12 +15,14 @@
 //! |---|---|
 //! | `http` | addresses, answers and their limits, what goes over the wire |
 //! | `tasks` | the wishes and the tasks that fulfil them |
+//! | `stream` | what comes without being wished for, and when it ends |
 //! | `batch` | batches: put together, and cut from a stream of bytes |
 //! | `error` | why something was not fetched |
 
 mod batch;
 mod error;
 mod http;
+mod stream;
 mod tasks;
 
 #[cfg(test)]
@@ -33,11 +35,12 @@ pub use http::LAYERS_MAX;
 use bytes::Bytes;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::Entry;
-use diamantina_protocol::message::Scene;
+use diamantina_protocol::message::{Scene, StreamAsk};
 use foldhash::fast::RandomState;
 use http::{Counters, Http, parse_address};
 use reqwest::Client;
 use std::collections::HashSet;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, mpsc};
 use std::time::Duration;
 use tasks::{Shared, work};
@@ -177,6 +180,8 @@ impl Fetcher {
             requests_max,
             state: Mutex::default(),
             changed: Notify::new(),
+            taken: Notify::new(),
+            waiting_bytes: AtomicUsize::new(0),
             sender,
         });
         for _ in 0..requests_max {
@@ -189,6 +194,8 @@ impl Fetcher {
     pub fn poll(&mut self) -> Option<Event> {
         let (serial, event) = self.events.try_recv().ok()?;
         self.seen = serial;
+        self.shared.waiting_bytes.fetch_sub(stream::weight(&event), Ordering::Relaxed);
+        self.shared.taken.notify_waiters();
         Some(event)
     }
 
@@ -206,7 +213,9 @@ impl Fetcher {
             let wished: HashSet<Key, RandomState> = wishes.iter().map(|want| want.key).collect();
             let wanted: HashSet<u64> =
                 state.flying.iter().filter(|(key, _)| wished.contains(key)).map(|(_, id)| *id).collect();
-            for (_, flight) in state.flights.iter().filter(|(id, _)| !wanted.contains(id)) {
+            for (_, flight) in
+                state.flights.iter().filter(|(id, f)| f.stream.is_none() && !wanted.contains(id))
+            {
                 flight.cancel.notify_one();
             }
             if state.failures.len() > FAILURES_MAX {
@@ -216,6 +225,29 @@ impl Fetcher {
         }
         drop(state);
         self.shared.changed.notify_waiters();
+    }
+
+    /// Asks for what is worth the most, in one request of its own, ahead of all wishes. While it is under way,
+    /// wishes for its layer rest. It replaces the layer's last one.
+    pub fn stream(&mut self, layer: usize, ask: StreamAsk) {
+        let mut state = self.shared.lock();
+        state.end_streams(|other| other == layer);
+        state.streams.push_back((layer, ask));
+        drop(state);
+        self.shared.changed.notify_waiters();
+    }
+
+    /// Drops all streams. What has arrived of them stays.
+    pub fn end_streams(&mut self) {
+        self.shared.lock().end_streams(|_| true);
+        self.shared.changed.notify_waiters();
+    }
+
+    /// Whether a stream is under way, or about to be.
+    #[must_use]
+    pub fn is_streaming(&self) -> bool {
+        let state = self.shared.lock();
+        !state.streams.is_empty() || state.flights.values().any(|flight| flight.stream.is_some())
     }
 
     /// Says that what arrived for `key` was no good. It is fetched again, after a pause.
@@ -230,7 +262,10 @@ impl Fetcher {
     pub fn is_stuck(&self) -> bool {
         let state = self.shared.lock();
         let rests = |want: &Want| state.failures.get(&want.key).is_some_and(|f| f.tries >= TRIES_MAX);
-        state.flights.is_empty() && !state.wishes.is_empty() && state.wishes.iter().all(rests)
+        state.flights.is_empty()
+            && state.streams.is_empty()
+            && !state.wishes.is_empty()
+            && state.wishes.iter().all(rests)
     }
 
     /// What has gone over the wire so far.

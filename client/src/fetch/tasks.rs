@@ -2,13 +2,15 @@
 
 use super::batch::{Batch, Frames};
 use super::http::{Http, PAGE_BYTES_MAX, count, pause, shortened};
+use super::stream::weight;
 use super::{Event, FetchError, Key, REST, TRIES_MAX, Want};
 use bytes::Bytes;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index;
-use diamantina_protocol::message::{self, FrameHeader, Scene, Status};
+use diamantina_protocol::message::{self, FrameHeader, Scene, Status, StreamAsk};
 use foldhash::fast::RandomState;
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 use std::time::Instant;
 use tokio::sync::Notify;
@@ -21,12 +23,18 @@ pub(super) struct Shared {
     // A std Mutex: nothing awaits while it is held, nor does more than look through the wishes.
     pub(super) state: Mutex<State>,
     pub(super) changed: Notify,
+    /// Tells streams that an event has been taken.
+    pub(super) taken: Notify,
+    /// Bytes of events that no frame has taken yet.
+    pub(super) waiting_bytes: AtomicUsize,
     pub(super) sender: mpsc::Sender<(u64, Event)>,
 }
 
 #[derive(Debug, Default)]
 pub(super) struct State {
     pub(super) wishes: Vec<Want>,
+    /// Streams that have not begun: at most one a layer.
+    pub(super) streams: VecDeque<(usize, StreamAsk)>,
     pub(super) flights: HashMap<u64, Flight>,
     /// What requests in flight still owe, with the request's number.
     pub(super) flying: HashMap<Key, u64, RandomState>,
@@ -43,6 +51,8 @@ pub(super) struct State {
 pub(super) struct Flight {
     pub(super) cancel: Arc<Notify>,
     is_page: bool,
+    /// The layer, if it is a stream.
+    pub(super) stream: Option<usize>,
     /// Whether something of it has arrived.
     useful: bool,
 }
@@ -62,6 +72,23 @@ enum Next {
 enum Request {
     Page(usize, u32),
     Batch(usize, Vec<(Diamond, Option<u32>)>),
+    Stream(usize, StreamAsk),
+}
+
+impl State {
+    /// Drops the streams of some layers.
+    pub(super) fn end_streams(&mut self, of: impl Fn(usize) -> bool) {
+        self.streams.retain(|(layer, _)| !of(*layer));
+        for flight in self.flights.values().filter(|flight| flight.stream.is_some_and(&of)) {
+            flight.cancel.notify_one();
+        }
+    }
+
+    /// Whether a layer's wishes rest, since a stream may bring them.
+    fn rests(&self, layer: usize) -> bool {
+        let flies = |flight: &Flight| flight.stream == Some(layer);
+        self.streams.iter().any(|(l, _)| *l == layer) || self.flights.values().any(flies)
+    }
 }
 
 /// One of the tasks that fetch.
@@ -108,8 +135,15 @@ impl Shared {
         let mut soonest: Option<Instant> = None;
         let mut page = None;
         let mut batch: Option<Batch> = None;
-        for want in &state.wishes {
-            if state.flying.contains_key(&want.key) || state.delivered.contains_key(&want.key) {
+        let stream = state.streams.pop_front();
+        let resting: Vec<bool> = (0..self.scene.layers.len()).map(|layer| state.rests(layer)).collect();
+        let wishes = if stream.is_none() { state.wishes.as_slice() } else { &[] };
+        for want in wishes {
+            let (Key::Page(layer, _) | Key::Diamond(layer, _)) = want.key;
+            if resting[layer]
+                || state.flying.contains_key(&want.key)
+                || state.delivered.contains_key(&want.key)
+            {
                 continue;
             }
             if let Some(failure) = state.failures.get(&want.key).filter(|f| f.not_before > now) {
@@ -130,13 +164,14 @@ impl Shared {
         }
         // Of several tasks, one is left for diamonds: pages alone draw nothing.
         let pages = state.flights.values().filter(|flight| flight.is_page).count();
-        let request = match (page, batch) {
-            (Some((layer, number, first)), batch)
+        let request = match (page, batch, stream) {
+            (_, _, Some((layer, ask))) => Request::Stream(layer, ask),
+            (Some((layer, number, first)), batch, None)
                 if batch.is_none() || (first && pages + 1 < self.requests_max) =>
             {
                 Request::Page(layer, number)
             }
-            (_, Some(batch)) => Request::Batch(batch.layer, batch.wants),
+            (_, Some(batch), None) => Request::Batch(batch.layer, batch.wants),
             _ => return Next::Wait(soonest),
         };
         if state.flights.is_empty() {
@@ -151,10 +186,12 @@ impl Shared {
             Request::Batch(layer, wants) => {
                 state.flying.extend(wants.iter().map(|(d, _)| (Key::Diamond(*layer, *d), id)));
             }
+            Request::Stream(..) => {}
         }
         let cancel = Arc::new(Notify::new());
         let is_page = matches!(request, Request::Page(..));
-        state.flights.insert(id, Flight { cancel: Arc::clone(&cancel), is_page, useful: false });
+        let stream = if let Request::Stream(layer, _) = &request { Some(*layer) } else { None };
+        state.flights.insert(id, Flight { cancel: Arc::clone(&cancel), is_page, stream, useful: false });
         Next::Fetch { id, cancel, request }
     }
 
@@ -195,6 +232,7 @@ impl Shared {
                     None => Err(FetchError::Early(shortened(&route))),
                 }
             }
+            Request::Stream(layer, ask) => self.stream(*layer, ask).await,
         }
     }
 
@@ -217,13 +255,18 @@ impl Shared {
             // The index was not there to tell that there is none.
             Status::Missing if bytes.is_none() && header.length == 0 => {}
             Status::Missing | Status::Damaged => return Err(FetchError::Missing(d.centre())),
+            Status::Page => return Err(FetchError::Unasked(d.centre())),
             Status::Ok => {}
         }
         self.deliver(Key::Diamond(layer, d), Event::Payload(layer, d, payload));
         Ok(())
     }
 
-    fn deliver(&self, key: Key, event: Event) {
+    pub(super) fn waiting_bytes(&self) -> usize {
+        self.waiting_bytes.load(Ordering::Relaxed)
+    }
+
+    pub(super) fn deliver(&self, key: Key, event: Event) {
         let mut state = self.lock();
         if let Some(id) = state.flying.remove(&key)
             && let Some(flight) = state.flights.get_mut(&id)
@@ -234,6 +277,7 @@ impl Shared {
         state.serial += 1;
         let serial = state.serial;
         state.delivered.insert(key, serial);
+        self.waiting_bytes.fetch_add(weight(&event), Ordering::Relaxed);
         // Nobody listens any more when the fetcher is dropped.
         let _ = self.sender.send((serial, event));
     }
@@ -307,6 +351,7 @@ impl Shared {
             state.stopped = true;
             state.flights.clear();
             state.flying.clear();
+            state.streams.clear();
             state.serial += 1;
             // As above.
             let _ = self.sender.send((state.serial, Event::SceneChanged));
