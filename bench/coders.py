@@ -177,7 +177,9 @@ def _pcodec() -> Codec:
         residual = _residual(steps)
         # One place has the whole height; two bytes where they do, as a user would choose.
         wide = bool(np.abs(residual).max() > 32767)
-        return bytes([wide]) + ic.pcodec_encode(residual.astype(np.int32 if wide else np.int16).ravel(), level=12)
+        return bytes([wide]) + ic.pcodec_encode(
+            residual.astype(np.int32 if wide else np.int16).ravel(), level=12
+        )
 
     def decode(data: bytes, shape: tuple[int, int]) -> np.ndarray:
         kind = np.int32 if data[0] else np.int16
@@ -227,8 +229,12 @@ def _terrain_rgb(image: str, interval: str) -> Codec:
     cost = 2 if image == "WebP" else 0
     if interval == "own":
         return _stepwise(
-            f"{image} terrain-rgb, own interval", f"{image} 100 6 own", lambda s: to(_rgb(s.astype(np.int64))),
-            lambda data, _: _grey(back(data)), cost=cost, few=image == "PNG",
+            f"{image} terrain-rgb, own interval",
+            f"{image} 100 6 own",
+            lambda s: to(_rgb(s.astype(np.int64))),
+            lambda data, _: _grey(back(data)),
+            cost=cost,
+            few=image == "PNG",
         )
 
     def step(scale: Scale) -> float:
@@ -247,7 +253,9 @@ def _terrain_rgb(image: str, interval: str) -> Codec:
         return (_grey(back(data)) - base) / 10
 
     label = "Mapbox encoding" if interval == "mapbox" else "Mapbox, steps of 2^k"
-    return Codec(f"{image} terrain-rgb, {label}", f"{image} 100 6 {interval}", encode, decode, cost=cost, few=True)
+    return Codec(
+        f"{image} terrain-rgb, {label}", f"{image} 100 6 {interval}", encode, decode, cost=cost, few=True
+    )
 
 
 def _jxl(effort: int) -> Codec:
@@ -257,15 +265,21 @@ def _jxl(effort: int) -> Codec:
     cost = 1 if effort > 3 else 0
     phases = ("zero", "lowest") if effort > 3 else ("zero",)
     return _stepwise(
-        f"JPEG XL effort {effort}", f"jxl {effort} {' '.join(phases)}", encode,
-        lambda data, _: ic.jpegxl_decode(data, numthreads=1), cost=cost, phases=phases,
+        f"JPEG XL effort {effort}",
+        f"jxl {effort} {' '.join(phases)}",
+        encode,
+        lambda data, _: ic.jpegxl_decode(data, numthreads=1),
+        cost=cost,
+        phases=phases,
     )
 
 
 def _j2k(steps: np.ndarray) -> bytes:
     # As many halvings as a small tile allows.
     halvings = min(6, max(1, int(np.log2(min(steps.shape)))))
-    return ic.jpeg2k_encode(steps, level=0, reversible=True, codecformat="j2k", resolutions=halvings, numthreads=1)
+    return ic.jpeg2k_encode(
+        steps, level=0, reversible=True, codecformat="j2k", resolutions=halvings, numthreads=1
+    )
 
 
 def mask_bytes(valid: np.ndarray) -> bytes:
@@ -282,26 +296,38 @@ CODECS: list[Codec] = [
     _lerc(zstd=False),
     _lerc(zstd=True),
     _jpegls_near(),
-    _stepwise("JPEG-LS", "jpegls 0", lambda s: ic.jpegls_encode(s, level=0), lambda data, _: ic.jpegls_decode(data)),
+    _stepwise(
+        "JPEG-LS", "jpegls 0", lambda s: ic.jpegls_encode(s, level=0), lambda data, _: ic.jpegls_decode(data)
+    ),
     _jxl(3),
     _jxl(9),
     *_floating(
-        "SZ3", "sz3 abs", lambda a, e: ic.sz3_encode(a, mode="abs", abs=e),
+        "SZ3",
+        "sz3 abs",
+        lambda a, e: ic.sz3_encode(a, mode="abs", abs=e),
         lambda data, shape: ic.sz3_decode(data, shape, np.float32),
     ),
     *_floating(
-        "SPERR", "sperr pwe", lambda a, e: ic.sperr_encode(a, level=e, mode="pwe", numthreads=1),
+        "SPERR",
+        "sperr pwe",
+        lambda a, e: ic.sperr_encode(a, level=e, mode="pwe", numthreads=1),
         lambda data, _: ic.sperr_decode(data, numthreads=1),
     ),
     # Its true error is far below its tolerance, so the largest tolerance that holds is sought from above.
     *_floating(
-        "zfp", "zfp accuracy", lambda a, e: ic.zfp_encode(a, level=e, mode="a", numthreads=1),
-        lambda data, _: ic.zfp_decode(data), factors=(8.0, 4.0, 2.0, *TIGHTER),
+        "zfp",
+        "zfp accuracy",
+        lambda a, e: ic.zfp_encode(a, level=e, mode="a", numthreads=1),
+        lambda data, _: ic.zfp_decode(data),
+        factors=(8.0, 4.0, 2.0, *TIGHTER),
     ),
     _pcodec(),
     _stepwise("JPEG 2000", "j2k reversible", _j2k, lambda data, _: ic.jpeg2k_decode(data)),
     _stepwise(
-        "HTJ2K", "htj2k reversible", lambda s: ic.htj2k_encode(s, reversible=True), lambda data, _: ic.htj2k_decode(data)
+        "HTJ2K",
+        "htj2k reversible",
+        lambda s: ic.htj2k_encode(s, reversible=True),
+        lambda data, _: ic.htj2k_decode(data),
     ),
     _zstd_predictor(),
     _terrain_rgb("WebP", "own"),

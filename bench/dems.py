@@ -98,7 +98,13 @@ class Dem:
     def fills(self) -> list[str]:
         """Ways of filling holes worth trying, for codecs that know no holes: the best counts."""
         share = self.samples / self.heights.size
-        return ["smooth"] if share > 0.99 else ["smooth", "nearest"] if share > 0.5 else ["smooth", "nearest", "hold"]
+        return (
+            ["smooth"]
+            if share > 0.99
+            else ["smooth", "nearest"]
+            if share > 0.5
+            else ["smooth", "nearest", "hold"]
+        )
 
     def filled(self, way: str) -> np.ndarray:
         """The heights without holes."""

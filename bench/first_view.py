@@ -69,8 +69,16 @@ class View:
         top = np.cross(right, forward)
         tan_y = math.tan(FOV_Y / 2)
         tan_x = tan_y * SIZE[0] / SIZE[1]
-        sides = [forward * tan_x + right, forward * tan_x - right, forward * tan_y + top, forward * tan_y - top]
-        return [(n / np.linalg.norm(n), -float(n @ self.eye) / float(np.linalg.norm(n))) for n in [*sides, forward]]
+        sides = [
+            forward * tan_x + right,
+            forward * tan_x - right,
+            forward * tan_y + top,
+            forward * tan_y - top,
+        ]
+        return [
+            (n / np.linalg.norm(n), -float(n @ self.eye) / float(np.linalg.norm(n)))
+            for n in [*sides, forward]
+        ]
 
     def tolerance(self, tile: "Tile") -> float | None:
         """Metres that a tile may be off, for a pixel; `None` outside the view."""
@@ -99,7 +107,8 @@ class Tile:
         half = self.span // 2
         return [
             Tile(self.level - 1, self.column + i * half, self.row + j * half, self.side)
-            for j in (0, 1) for i in (0, 1)
+            for j in (0, 1)
+            for i in (0, 1)
         ]
 
     def samples(self, heights: np.ndarray) -> np.ndarray:
@@ -193,8 +202,8 @@ class Meshes:
         return cost
 
     def best_fixed(self, view: View) -> tuple[tuple[int, int], float]:
-        """The cut of the best of several pyramids, and its error at tiles of `MESH_SIDE` samples. Finer levels,
-        which some of them would have below, are not needed for the view."""
+        """The cut of the best of several pyramids, and its error at tiles of `MESH_SIDE` samples. Finer
+        levels, which some of them would have below, are not needed for the view."""
         cuts = []
         for finest in (0.5, 1.0, 2.0, 4.0, 8.0, 16.0):
             try:
@@ -225,7 +234,11 @@ class Meshes:
         out = io.BytesIO()
         bounds = (0.0, 0.0, float(FULL), float(FULL))
         quantized_mesh_encoder.encode(
-            out, vertices.astype(np.float32), triangles.astype(np.uint32), bounds=bounds, sphere_method="bounding_box"
+            out,
+            vertices.astype(np.float32),
+            triangles.astype(np.uint32),
+            bounds=bounds,
+            sphere_method="bounding_box",
         )
         return out.getvalue(), part.shape
 
@@ -270,7 +283,9 @@ class Images:
         surface = np.rint(part[np.ix_(*knots)] / step) * step
         for axis in (0, 1):
             every = np.arange(part.shape[axis])
-            left = np.minimum(np.searchsorted(knots[axis], every, side="right") - 1, max(len(knots[axis]) - 2, 0))
+            left = np.minimum(
+                np.searchsorted(knots[axis], every, side="right") - 1, max(len(knots[axis]) - 2, 0)
+            )
             right = np.minimum(left + 1, len(knots[axis]) - 1)
             gap = np.maximum(knots[axis][right] - knots[axis][left], 1)
             share = ((every - knots[axis][left]) / gap).reshape((-1, 1) if axis == 0 else (1, -1))
@@ -278,8 +293,8 @@ class Images:
         return float(np.nanmax(np.abs(surface - tile.samples(self.heights))))
 
     def size(self, tile: Tile, step: float, own: bool) -> int:
-        """Bytes of the picture, without the rim that the neighbour has. `own`: a value is a step; else tenths of
-        a metre above -10 km."""
+        """Bytes of the picture, without the rim that the neighbour has. `own`: a value is a step; else tenths
+        of a metre above -10 km."""
         part = tile.samples(self.filled)[:: 1 << tile.level, :: 1 << tile.level][: tile.side, : tile.side]
         values = np.rint(part / step).astype(np.int64)
         values = values - values.min() if own else np.rint((values * step + 10_000) * 10).astype(np.int64)
@@ -303,9 +318,12 @@ class Images:
         return min((self.size(tile, step, own=True) for step in held[:2]), default=None)
 
     def fixed(self, step: float):
+        """Rounded twice as coarsely a level, as its resampling is coarser, too."""
+
         def cost(tile: Tile, tolerance: float) -> int | None:
-            held = self.error(tile, step) <= tolerance or tile.level == 0
-            return self.size(tile, step, own=False) if held else None
+            coarse = step * 2.0**tile.level
+            held = self.error(tile, coarse) <= tolerance
+            return self.size(tile, coarse, own=False) if held else None
 
         return cost
 
@@ -320,13 +338,25 @@ def ours(server: Path, client: Path, dem, error: float, work: Path, low: bool) -
             command += [f"--{name.replace('_', '-')}", repr(value)]
         if dem.nodata is not None:
             command += [f"--nodata={dem.nodata!r}"]
-        report = subprocess.run([*command, "-o", str(store), "--json"], check=True, capture_output=True, text=True)
+        report = subprocess.run(
+            [*command, "-o", str(store), "--json"], check=True, capture_output=True, text=True
+        )
         layer = json.loads(report.stdout)["scene"]["layers"][0]
         serve = [str(server), "serve", str(store), "--listen", "127.0.0.1:0"]
         with subprocess.Popen(serve, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as running:
             try:
-                url = next(word for line in running.stdout for word in line.split() if word.startswith("http://"))
-                render = [str(client), "render", url.rstrip(".,"), "-o", str(Path(folder) / "view.png"), "--json", "-"]
+                url = next(
+                    word for line in running.stdout for word in line.split() if word.startswith("http://")
+                )
+                render = [
+                    str(client),
+                    "render",
+                    url.rstrip(".,"),
+                    "-o",
+                    str(Path(folder) / "view.png"),
+                    "--json",
+                    "-",
+                ]
                 render += ["--size", f"{SIZE[0]}x{SIZE[1]}", "--error-pixels", "1"]
                 if low:
                     eye, target = low_view(layer, dem)
@@ -341,7 +371,11 @@ def low_view(layer: dict, dem) -> tuple[str, str]:
     heights = dem.heights[::-1]
     rows, columns = heights.shape
     x, y = layer["cell"][0] * (columns // 2), layer["cell"][1] * (rows // 20)
-    eye = [layer["origin"][0] + x, layer["origin"][1] + y, np.nanmax(heights[rows // 20, columns // 2]) + 2000.0]
+    eye = [
+        layer["origin"][0] + x,
+        layer["origin"][1] + y,
+        np.nanmax(heights[rows // 20, columns // 2]) + 2000.0,
+    ]
     target = [eye[0], layer["origin"][1] + layer["cell"][1] * (rows // 2), float(np.nanmean(heights))]
     return ",".join(f"{v:.3f}" for v in eye), ",".join(f"{v:.3f}" for v in target)
 
@@ -349,10 +383,17 @@ def low_view(layer: dict, dem) -> tuple[str, str]:
 def rows_of(cache: Cache, dem, error: float, server: Path, client: Path, work: Path, low: bool) -> list[dict]:
     report, layer = ours(server, client, dem, error, work, low)
     if not report["complete"] or report["largest_error_pixels"] > 1:
-        raise SystemExit(f"{dem.name}: our own view has {report['largest_error_pixels']:.2f} pixels: lower --max-error")
+        raise SystemExit(
+            f"{dem.name}: our own view has {report['largest_error_pixels']:.2f} pixels: lower --max-error"
+        )
     origin = np.array([*layer["origin"], 0.0])
     heights = np.ascontiguousarray(dem.heights[::-1])
-    view = View(np.array(report["eye"]) - origin, np.array(report["target"]) - origin, np.array(layer["cell"]), heights)
+    view = View(
+        np.array(report["eye"]) - origin,
+        np.array(report["target"]) - origin,
+        np.array(layer["cell"]),
+        heights,
+    )
     meshes, images = Meshes(cache, dem.hash, heights), Images(cache, heights)
     name = f"{dem.name}, {'low' if low else 'overview'}"
     base = {"view": name, "what": "diamantina", "bytes": report["bytes"], "tiles": report["requests"]}
@@ -370,7 +411,10 @@ def rows_of(cache: Cache, dem, error: float, server: Path, client: Path, work: P
         # The largest power of two of tenths of a metre that keeps the error of the store.
         step = 2.0 ** math.floor(math.log2(max(20 * error, 1))) / 10
         top = root(heights, side)
-        add(f"terrain-rgb WebP {side}², fixed (Mapbox, {step:g} m)", coarsest(view, top, images.fixed(step)))
+        add(
+            f"terrain-rgb WebP {side}², fixed (Mapbox, steps of {step:g} m, twice that a level)",
+            coarsest(view, top, images.fixed(step)),
+        )
         add(f"terrain-rgb WebP {side}², fitted", cheapest(view, top, images.fitted))
     return rows
 
@@ -387,9 +431,15 @@ def table(rows: list[dict]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, help="folder of DEMs [default: DIAMANTINA_DATA, else ../shared/data]")
-    parser.add_argument("--only", default="alps,hills,puget,rainier", help="names of DEMs, with commas between")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--data", type=Path, help="folder of DEMs [default: DIAMANTINA_DATA, else ../shared/data]"
+    )
+    parser.add_argument(
+        "--only", default="alps,hills,puget,rainier", help="names of DEMs, with commas between"
+    )
     parser.add_argument("--max-error", type=float, default=1.0, help="of our stores, in metres")
     parser.add_argument("--json", type=Path, help="write every figure here")
     arguments = parser.parse_args()
@@ -399,7 +449,7 @@ def main() -> None:
     for program in programs:
         if not program.exists():
             raise SystemExit(
-                f"{program}: not found. Build it: cargo build --release --locked -p diamantina-server -p diamantina-client"
+                f"{program}: not found. Build it: cargo build --release --locked -p {program.name}"
             )
     if not (folder / "MANIFEST.tsv").exists():
         raise SystemExit(f"{folder}: no MANIFEST.tsv there. Name the folder of DEMs with DIAMANTINA_DATA")

@@ -76,7 +76,9 @@ def masks(cache: Cache, dem: Dem, layout: str) -> int:
     return known["bytes"]
 
 
-def peer(cache: Cache, dem: Dem, codec: Codec, error: float, unit: float, layout: str, fetch_only: bool) -> dict | None:
+def peer(
+    cache: Cache, dem: Dem, codec: Codec, error: float, unit: float, layout: str, fetch_only: bool
+) -> dict | None:
     """The figure of a peer: the fewest bytes among the ways of filling holes. `None` if not kept and
     `fetch_only`; a figure without `bytes` says in `why` why there is none."""
     where = (dem.hash, codec.key, repr(error), repr(unit), layout)
@@ -112,7 +114,11 @@ def _search(dem: Dem, codec: Codec, scale: Scale, layout: str, way: str) -> dict
         if factor == 1.0:
             asked = figure["error"]
         if figure["error"] <= scale.error * (1 + 1e-9) + 1e-9:
-            return figure | {"factor": factor, "fill": way, "error_as_asked": asked if asked is not None else None}
+            return figure | {
+                "factor": factor,
+                "fill": way,
+                "error_as_asked": asked if asked is not None else None,
+            }
     return {"why": f"no tolerance holds: true error {asked:.6g}", "error_as_asked": asked}
 
 

@@ -42,7 +42,8 @@ def errors_of(dem: Dem, unit: float, asked: list[float] | None) -> dict[float, s
         whole = np.floor(error / unit + 1e-9) if unit > 0 else error
         if whole not in seen:
             seen.add(whole)
-            kept[error] = found[error]
+            # Less than a unit of the source leaves no choice.
+            kept[error] = found[error] if whole > 0 else f"{error:g} m: lossless"
     return kept
 
 
@@ -146,12 +147,21 @@ def say(text: str) -> None:
 
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, help="folder of DEMs [default: DIAMANTINA_DATA, else ../shared/data]")
-    parser.add_argument("--only", help="names of DEMs, with commas between")
-    parser.add_argument("--errors", help="maximum errors in metres, with commas between, instead of each DEM's own")
-    parser.add_argument("--ours-only", action="store_true", help="measure only ours; of peers show what is kept")
     parser.add_argument(
-        "--cost", type=int, default=2, choices=range(3),
+        "--data", type=Path, help="folder of DEMs [default: DIAMANTINA_DATA, else ../shared/data]"
+    )
+    parser.add_argument("--only", help="names of DEMs, with commas between")
+    parser.add_argument(
+        "--errors", help="maximum errors in metres, with commas between, instead of each DEM's own"
+    )
+    parser.add_argument(
+        "--ours-only", action="store_true", help="measure only ours; of peers show what is kept"
+    )
+    parser.add_argument(
+        "--cost",
+        type=int,
+        default=2,
+        choices=range(3),
         help="measure the fast peers (0), JPEG XL at effort 9, too (1), WebP, too (2)",
     )
     parser.add_argument("--speed", action="store_true", help="also time decoders, ours with cargo bench")

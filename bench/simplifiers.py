@@ -50,7 +50,9 @@ def martini(heights: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
     return np.column_stack([vertices, z]).astype(np.float64), triangles.reshape(-1, 3)
 
 
-def true_error(xy: np.ndarray, z: np.ndarray, triangles: np.ndarray, heights: np.ndarray) -> tuple[float, int]:
+def true_error(
+    xy: np.ndarray, z: np.ndarray, triangles: np.ndarray, heights: np.ndarray
+) -> tuple[float, int]:
     """The largest distance of a sample from its triangle, and how many samples have none."""
     surface = rasterise(xy, z, triangles, heights.shape)
     covered = np.isfinite(surface)
