@@ -36,6 +36,7 @@ from pydelatin import Delatin
 import simplifiers
 from dems import all_dems, fill
 from measure import Cache
+from ours import build_command
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZE = (1380, 768)
@@ -55,6 +56,8 @@ class View:
     target: np.ndarray
     cell: np.ndarray
     heights: np.ndarray
+    # Metres that any tile may be off: the error of our store.
+    least: float
 
     def pixels_per_radian(self) -> float:
         return SIZE[1] / (2 * math.tan(FOV_Y / 2))
@@ -81,13 +84,14 @@ class View:
         ]
 
     def tolerance(self, tile: "Tile") -> float | None:
-        """Metres that a tile may be off, for a pixel; `None` outside the view."""
+        """Metres that a tile may be off, for a pixel; `None` outside the view. A box around the eye, as large
+        tiles of rough ground have, asks no more than the finest error: others are not charged for it."""
         low, high = tile.box(self)
         for normal, offset in self.planes():
             if normal @ np.where(normal >= 0, high, low) + offset < 0:
                 return None
         nearest = np.clip(self.eye, low, high)
-        return float(np.linalg.norm(nearest - self.eye)) / self.pixels_per_radian()
+        return max(self.least, float(np.linalg.norm(nearest - self.eye)) / self.pixels_per_radian())
 
 
 @dataclass(frozen=True)
@@ -333,14 +337,8 @@ def ours(server: Path, client: Path, dem, error: float, work: Path, low: bool) -
     from the south of it, 2000 m above the ground, looking north."""
     with tempfile.TemporaryDirectory(dir=work) as folder:
         store = Path(folder) / "scene"
-        command = [str(server), "build", str(dem.source(work)), "--crs", "source", "--max-error", repr(error)]
-        for name, value in dem.options.items():
-            command += [f"--{name.replace('_', '-')}", repr(value)]
-        if dem.nodata is not None:
-            command += [f"--nodata={dem.nodata!r}"]
-        report = subprocess.run(
-            [*command, "-o", str(store), "--json"], check=True, capture_output=True, text=True
-        )
+        command = build_command(server, dem, error, store, work)
+        report = subprocess.run(command, check=True, capture_output=True, text=True)
         layer = json.loads(report.stdout)["scene"]["layers"][0]
         serve = [str(server), "serve", str(store), "--listen", "127.0.0.1:0"]
         with subprocess.Popen(serve, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as running:
@@ -388,12 +386,8 @@ def rows_of(cache: Cache, dem, error: float, server: Path, client: Path, work: P
         )
     origin = np.array([*layer["origin"], 0.0])
     heights = np.ascontiguousarray(dem.heights[::-1])
-    view = View(
-        np.array(report["eye"]) - origin,
-        np.array(report["target"]) - origin,
-        np.array(layer["cell"]),
-        heights,
-    )
+    eye, target = np.array(report["eye"]) - origin, np.array(report["target"]) - origin
+    view = View(eye, target, np.array(layer["cell"]), heights, error)
     meshes, images = Meshes(cache, dem.hash, heights), Images(cache, heights)
     name = f"{dem.name}, {'low' if low else 'overview'}"
     base = {"view": name, "what": "diamantina", "bytes": report["bytes"], "tiles": report["requests"]}
