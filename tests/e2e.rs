@@ -13,6 +13,8 @@ mod determinism;
 mod hostile;
 /// What the server answers to whom: routes, caches, refusals, heights.
 mod http;
+/// Law 7: a build that was killed, stopped or ran out of disk goes on; the bytes are those of an unbroken one.
+mod resume;
 /// Law 2: any cut of a built store, with anything missing, has no cracks.
 mod seams;
 /// Streaming from end to end: pictures, bytes, flights with late data.
