@@ -12,19 +12,19 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 /// Longer than any of these may take on the slowest machine.
-const PATIENCE: Duration = Duration::from_secs(180);
+pub(crate) const PATIENCE: Duration = Duration::from_secs(180);
 
 /// How a program ended.
 #[derive(Debug)]
-struct Ended {
+pub(crate) struct Ended {
     /// `None`: by a signal.
-    code: Option<i32>,
-    out: String,
-    err: String,
+    pub(crate) code: Option<i32>,
+    pub(crate) out: String,
+    pub(crate) err: String,
 }
 
 /// Waits for a program, which must end by itself.
-fn end(mut child: Child) -> Ended {
+pub(crate) fn end(mut child: Child) -> Ended {
     let drain = |stream: Option<Box<dyn Read + Send>>| {
         std::thread::spawn(move || {
             let mut bytes = Vec::new();
@@ -53,7 +53,7 @@ fn end(mut child: Child) -> Ended {
     Ended { code: status.code(), out, err }
 }
 
-fn start(program: &Path, args: &[OsString]) -> Child {
+pub(crate) fn start(program: &Path, args: &[OsString]) -> Child {
     Command::new(program)
         .args(args)
         .env_remove("RUST_LOG")
@@ -65,11 +65,11 @@ fn start(program: &Path, args: &[OsString]) -> Child {
 }
 
 /// Arguments: words, with `{}` standing for the folder.
-fn words(folder: &Path, text: &str) -> Vec<OsString> {
+pub(crate) fn words(folder: &Path, text: &str) -> Vec<OsString> {
     text.split_whitespace().map(|w| w.replace("{}", folder.to_str().unwrap()).into()).collect()
 }
 
-fn server(folder: &Path, text: &str) -> Ended {
+pub(crate) fn server(folder: &Path, text: &str) -> Ended {
     end(start(&programs().server, &words(folder, text)))
 }
 
@@ -78,7 +78,7 @@ fn client(folder: &Path, text: &str) -> Ended {
 }
 
 /// It failed as it should: code, empty standard output, and these words.
-fn assert_failed(ended: &Ended, code: i32, wanted: &[&str], what: &str) {
+pub(crate) fn assert_failed(ended: &Ended, code: i32, wanted: &[&str], what: &str) {
     assert_eq!(ended.code, Some(code), "{what}: {ended:?}");
     assert_eq!(ended.out, "", "{what} prints to standard output");
     assert!(!ended.err.contains("panicked"), "{what}: {}", ended.err);
@@ -488,7 +488,7 @@ fn old_scene(folder: &Path) -> std::collections::BTreeMap<PathBuf, Vec<u8>> {
 }
 
 /// The files of the store that a reader uses.
-fn scene_files(folder: &Path) -> std::collections::BTreeMap<PathBuf, Vec<u8>> {
+pub(crate) fn scene_files(folder: &Path) -> std::collections::BTreeMap<PathBuf, Vec<u8>> {
     let mut all = files(&folder.join("disk/store"));
     all.retain(|path, _| !path.starts_with(".building") && path != Path::new(".lock"));
     all
@@ -543,7 +543,7 @@ fn a_disk_that_fills_up_leaves_the_old_scene_untouched() {
 }
 
 /// Sends a signal to a child.
-fn signal(child: &Child, name: &str) {
+pub(crate) fn signal(child: &Child, name: &str) {
     let status = Command::new("kill").args([&format!("-{name}"), &child.id().to_string()]).status().unwrap();
     assert!(status.success());
 }

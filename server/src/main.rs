@@ -3,7 +3,7 @@
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use diamantina_protocol::message::{Kind, is_name};
 use diamantina_protocol::points::Rule;
-use diamantina_server::hierarchy::{self, BuildError, Report};
+use diamantina_server::hierarchy::{self, BuildError, Estimate, Report};
 use diamantina_server::ingest::IngestError;
 use diamantina_server::inspect::{self, Inspection};
 use diamantina_server::progress::Progress;
@@ -14,6 +14,8 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
+use std::time::Duration;
+use tokio::signal::unix::{SignalKind, signal};
 
 /// Builds and serves streamed terrain.
 #[derive(Parser)]
@@ -72,6 +74,15 @@ struct BuildArgs {
     scene: Option<String>,
     #[command(flatten)]
     ingest: ingest::Options,
+    /// Begin anew even where an interrupted build of the same could be gone on with
+    #[arg(long)]
+    fresh: bool,
+    /// Seconds between checkpoints: the most work that a kill costs
+    #[arg(long, default_value_t = hierarchy::CHECKPOINT.as_secs(), value_name = "SECONDS")]
+    checkpoint: u64,
+    /// Only estimate, from a sample of the source, what the build would take and give; nothing is written
+    #[arg(long)]
+    dry_run: bool,
     /// Print the report as JSON
     #[arg(long)]
     json: bool,
@@ -156,7 +167,13 @@ fn parse_bytes(text: &str) -> Result<u64, String> {
     value.checked_mul(scale).ok_or_else(|| "more than 16 EiB".to_owned())
 }
 
-/// A failure with its exit code: 1 failed, 2 wrong use.
+/// The exit code of a build that was asked to stop.
+const INTERRUPTED: u8 = 130;
+
+/// How long a build may take to stop.
+const STOP_MAX: Duration = Duration::from_millis(9500);
+
+/// A failure with its exit code: 1 failed, 2 wrong use, 130 interrupted.
 struct Failure(u8, String);
 
 impl<E: std::error::Error> From<E> for Failure {
@@ -248,9 +265,23 @@ fn build(args: BuildArgs) -> Result<(), Failure> {
             _ => 6,
         },
         memory: args.memory,
+        fresh: args.fresh,
+        checkpoint: Duration::from_secs(args.checkpoint),
     };
     let source = ingest::open(&args.sources, &args.ingest).map_err(|e| refuse_build(&[], &e.into()))?;
-    let report = hierarchy::build(&source, &args.output, &options, &Progress::new())
+    if args.dry_run {
+        let estimate = hierarchy::estimate(&source, &options).map_err(|e| refuse_build(&args.sources, &e))?;
+        let mut out = std::io::stdout().lock();
+        if args.json {
+            writeln!(out, "{}", serde_json::to_string_pretty(&estimate)?)?;
+        } else {
+            print_estimate(&mut out, &args.output, &estimate)?;
+        }
+        return Ok(());
+    }
+    let progress = Arc::new(Progress::new());
+    stop_on_signals(&progress)?;
+    let report = hierarchy::build(&source, &args.output, &options, &progress)
         .map_err(|e| refuse_build(&args.sources, &e))?;
     let mut out = std::io::stdout().lock();
     if args.json {
@@ -258,6 +289,29 @@ fn build(args: BuildArgs) -> Result<(), Failure> {
     } else {
         shown(print_report(&mut out, &args.output, &report))?;
     }
+    Ok(())
+}
+
+/// The first Ctrl-C or SIGTERM asks for a stop, which keeps what is done; a second one ends the program at once,
+/// and so do ten seconds.
+fn stop_on_signals(progress: &Arc<Progress>) -> std::io::Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let guard = runtime.enter();
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let mut terminate = signal(SignalKind::terminate())?;
+    drop(guard);
+    let progress = Arc::clone(progress);
+    std::thread::spawn(move || {
+        runtime.block_on(async {
+            tokio::select! { _ = interrupt.recv() => {}, _ = terminate.recv() => {} }
+            progress.stop();
+            progress.say("stopping; once more ends at once");
+            // Whatever holds the build up, its last checkpoint is on the disk.
+            let patience = tokio::time::sleep(STOP_MAX);
+            tokio::select! { _ = interrupt.recv() => {}, _ = terminate.recv() => {}, () = patience => {} }
+        });
+        std::process::exit(i32::from(INTERRUPTED));
+    });
     Ok(())
 }
 
@@ -276,7 +330,37 @@ fn refuse_build(sources: &[PathBuf], error: &BuildError) -> Failure {
     let names: Vec<String> =
         sources.iter().filter(|_| about_heights).map(|s| s.display().to_string()).collect();
     let from = if names.is_empty() { String::new() } else { format!("{}: ", names.join(", ")) };
-    Failure(if wrong_use { 2 } else { 1 }, format!("{from}{error}"))
+    let code = match error {
+        BuildError::Interrupted { .. } => INTERRUPTED,
+        _ if wrong_use => 2,
+        _ => 1,
+    };
+    Failure(code, format!("{from}{error}"))
+}
+
+fn print_estimate(out: &mut impl Write, store: &Path, e: &Estimate) -> std::io::Result<()> {
+    writeln!(
+        out,
+        "{}: estimated from {} of {} samples; nothing was written",
+        store.display(),
+        e.sampled,
+        e.samples
+    )?;
+    writeln!(out, "  {:.1} % nodata", 100.0 * (1.0 - e.valid_samples as f64 / e.samples as f64))?;
+    writeln!(
+        out,
+        "  about {} diamonds, {} bytes of points ({:.2} bits a sample)",
+        e.diamonds, e.point_bytes, e.bits_per_sample
+    )?;
+    let mebibytes = |bytes: u64| bytes as f64 / f64::from(1 << 20);
+    writeln!(
+        out,
+        "  about {:.1} s with {} threads, at most {:.0} MiB of memory, {:.0} MiB of disk while at work",
+        e.seconds,
+        rayon::current_num_threads(),
+        mebibytes(e.memory_bytes),
+        mebibytes(e.disk_bytes)
+    )
 }
 
 fn print_report(out: &mut impl Write, store: &Path, report: &Report) -> std::io::Result<()> {

@@ -8,6 +8,7 @@
     reason = "lattice coordinates are below 2^28, and the fine step is checked against its limit"
 )]
 
+use super::journal::Coded;
 use super::levels::blob_order;
 use super::plan::Plan;
 use super::transcribe::Stats;
@@ -146,31 +147,16 @@ fn detail(plan: &Plan, canvas: &Canvas, level: u32) -> io::Result<f64> {
     Ok(if count == 0 { 0.0 } else { (sum / count as f64).sqrt() })
 }
 
-/// What is known of a diamond when it has been coded.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Coded {
-    pub(super) low: i32,
-    pub(super) high: i32,
-    pub(super) bytes: u32,
-}
-
 impl Build<'_> {
     /// Codes a diamond whose old points are in `block`, and keeps what it took.
-    pub(super) fn code(
-        &self,
-        d: Diamond,
-        block: &mut Block,
-        source: &Block,
-    ) -> Result<(Diamond, Coded), BuildError> {
+    pub(super) fn code(&self, d: Diamond, block: &mut Block, source: &Block) -> Result<Coded, BuildError> {
         let payload = points::encode(&self.plan.forest, &self.coding, d, block, source);
-        let bytes = u32::try_from(payload.len()).unwrap_or(u32::MAX);
-        if bytes > 0 {
+        let mut spot = None;
+        if !payload.is_empty() {
             let [a, b] = d.centre();
             let key = Key { layer: 0, kind: BlobKind::Points, a, b };
-            self.writer.put(key, blob_order(&self.plan.forest, d), &payload)?;
+            spot = Some(self.work.writer.put(key, blob_order(d), &payload)?);
         }
-        let all = block.heights().iter().chain(source.heights()).filter(|h| **h != NODATA);
-        let (low, high) = all.fold((i32::MAX, i32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
-        Ok((d, Coded { low, high, bytes }))
+        Ok(Coded::new(d, block, source, spot))
     }
 }

@@ -18,12 +18,22 @@ pub enum BuildError {
     #[error(transparent)]
     Store(#[from] StoreError),
     /// The working files could not be written.
-    #[error("{path}: cannot write the working files: {error}; {}", if error.kind() == io::ErrorKind::StorageFull { "free some space (16/3 bytes a sample) and build again" } else { "check the disk, or choose another folder with -o" })]
+    #[error("{path}: cannot write the working files: {error}; {}", work_remedy(error))]
     Work {
         /// The work folder.
         path: PathBuf,
         /// What the system said.
         error: io::Error,
+    },
+    /// Somebody asked for a stop.
+    #[error(
+        "interrupted: {done} of {chunks} chunks are done; the same command goes on from there (--fresh starts anew)"
+    )]
+    Interrupted {
+        /// Chunks done.
+        done: u64,
+        /// All chunks.
+        chunks: u64,
     },
     /// No sample has a height.
     #[error(
@@ -79,4 +89,25 @@ pub enum BuildError {
 /// Bytes as the command line takes them, rounded up.
 fn mebibytes(bytes: u64) -> String {
     format!("{}MiB", bytes.div_ceil(1 << 20))
+}
+
+fn work_remedy(error: &io::Error) -> &'static str {
+    match error.kind() {
+        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
+            "free some space (16/3 bytes a sample) and build again: the same command goes on where this one \
+             ended (the old scene, if any, is untouched)"
+        }
+        _ => "check the disk, or choose another folder with -o",
+    }
+}
+
+impl BuildError {
+    /// Whether the work folder is of use to another run: the source and the options are not to blame.
+    pub(super) fn keeps_work(&self) -> bool {
+        match self {
+            Self::Work { .. } | Self::Interrupted { .. } => true,
+            Self::Store(error) => !matches!(error, StoreError::Spool { .. }),
+            _ => false,
+        }
+    }
 }

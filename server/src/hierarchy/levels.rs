@@ -1,27 +1,20 @@
 //! Codes every diamond: the coarse levels in memory, then chunk by chunk.
 
-#![allow(clippy::cast_possible_truncation, reason = "the levels of a forest are fewer than 64")]
+#![allow(clippy::cast_possible_truncation, reason = "chunks are fewer than 2^32, levels fewer than 64")]
 
-use super::coding::Coded;
-use super::surface::Surface;
+use super::journal::{Chunk, Coded, Record};
+use super::surface::{Surface, source_block};
+use super::tallies::Tally;
 use super::{Build, BuildError};
-use crate::canvas::Window;
 use crate::measure::{Found, Samples, measure};
-use crate::progress::Progress;
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::points;
 use rayon::prelude::*;
-use std::collections::HashMap;
-
-/// What the workers collect.
-#[derive(Debug, Default)]
-pub(super) struct Tallies {
-    pub(super) ranges: HashMap<Diamond, Coded>,
-    pub(super) found: HashMap<Diamond, Found>,
-    pub(super) finest: f64,
-}
+use std::collections::{BTreeSet, HashMap};
+use std::sync::PoisonError;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 /// What the coarse levels leave: the heights that each level draws.
 #[derive(Debug)]
@@ -32,7 +25,7 @@ pub(super) struct Coarse {
 
 /// A key that sorts blobs as a viewer descends: index pages first, then level by level along the Morton
 /// curve.
-pub(super) fn blob_order(forest: &Forest, d: Diamond) -> u64 {
+pub(super) fn blob_order(d: Diamond) -> u64 {
     let spread = |v: u32| {
         let mut v = u64::from(v) & 0x0fff_ffff;
         for (shift, mask) in [
@@ -48,25 +41,26 @@ pub(super) fn blob_order(forest: &Forest, d: Diamond) -> u64 {
     };
     let [x, y] = d.centre();
     // 2 x 27 bits below 6 bits of level: diamonds of a level lie at least two cells apart.
-    debug_assert!(forest.levels() < 63);
+    debug_assert!(d.level() < 63);
     u64::from(d.level() + 1) << 56 | spread(x >> 1) | spread(y >> 1) << 1
 }
 
-impl Build<'_> {
-    /// The source heights of a diamond's block.
-    fn source_block(&self, d: Diamond, window: &Window) -> Block {
-        let mut block = Block::empty(&self.plan.forest);
-        block.fill(&self.plan.forest.local(d), |x, y| window.at(x, y));
-        block
-    }
+/// The rectangle around some diamonds.
+fn bounds<'a>(forest: &Forest, diamonds: impl IntoIterator<Item = &'a Diamond>) -> Option<[[u32; 2]; 2]> {
+    diamonds
+        .into_iter()
+        .map(|d| forest.bounds(*d))
+        .reduce(|[a, b], [c, d]| [[a[0].min(c[0]), a[1].min(c[1])], [b[0].max(d[0]), b[1].max(d[1])]])
+}
 
+impl Build<'_> {
     /// Codes every level above the chunks.
     pub(super) fn coarse_levels(&self) -> Result<Coarse, BuildError> {
         let forest = &self.plan.forest;
         let size = forest.size();
         let chunk_level = self.plan.chunks.level();
         let plane = self.plan.spacing_log2(chunk_level);
-        let window = self.canvas.read(plane, [0, 0], size).map_err(self.work())?;
+        let window = self.canvas.read(plane, [0, 0], size).map_err(self.work.failure())?;
         let mut surfaces = vec![Surface::new(self.plan.spacing_log2(0), [0, 0], size)];
         let mut before: HashMap<Diamond, Block> = HashMap::new();
         for level in 0..chunk_level {
@@ -75,17 +69,23 @@ impl Build<'_> {
                 .collect::<Vec<_>>()
                 .into_par_iter()
                 .map(|d| {
+                    if self.work.progress.is_stopping() {
+                        return Err(self.interrupted());
+                    }
                     let mut block = inherited(forest, &before, d);
-                    let coded = self.code(d, &mut block, &self.source_block(d, &window))?;
+                    // The plane is finer than most of these levels.
+                    let mut source = Block::empty(forest);
+                    source.fill(&forest.local(d), |x, y| window.at(x, y));
+                    let coded = self.code(d, &mut block, &source)?;
                     Ok((d, block, coded))
                 })
                 .collect::<Result<_, BuildError>>()?;
             let mut surface = Surface::new(self.plan.spacing_log2(level + 1), [0, 0], size);
             before.clear();
-            let mut tallies = self.tallies.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-            for (d, block, (_, range)) in coded {
+            let mut tallies = self.tallies.lock().unwrap_or_else(PoisonError::into_inner);
+            for (d, block, coded) in coded {
                 surface.draw(forest, d, &block, size);
-                tallies.ranges.insert(d, range);
+                tallies.coded(d, Tally::from(&coded));
                 before.insert(d, block);
             }
             drop(tallies);
@@ -94,120 +94,145 @@ impl Build<'_> {
         Ok(Coarse { surfaces })
     }
 
-    /// Codes all chunks.
-    pub(super) fn chunks(&self, coarse: &Coarse, progress: &Progress) -> Result<(), BuildError> {
+    /// Codes all chunks that no earlier run has coded.
+    pub(super) fn chunks(&self, coarse: &Coarse) -> Result<(), BuildError> {
         let chunks = self.plan.chunks.corners();
         let cells = 1u64 << (2 * self.plan.chunks.side_log2());
-        progress.stage("build", chunks.len() as u64 * cells);
-        let next = std::sync::atomic::AtomicUsize::new(0);
+        let (all, before) = (chunks.len() as u64, self.done.load(Ordering::Relaxed));
+        self.work.progress.stage("build", "samples", all * cells, before * cells);
+        let next = AtomicUsize::new(0);
+        let failed = AtomicBool::new(false);
+        let go_on = || !self.work.progress.is_stopping() && !failed.load(Ordering::Relaxed);
         // As many workers as the memory allows, each taking the next chunk when it is done with one.
-        (0..self.plan.workers).into_par_iter().try_for_each(|_| {
-            while let Some(corner) = chunks.get(next.fetch_add(1, std::sync::atomic::Ordering::Relaxed)) {
-                self.chunk(*corner, coarse)?;
-                progress.advance(cells);
+        let worked: Result<(), BuildError> = (0..self.plan.workers).into_par_iter().try_for_each(|_| {
+            while go_on() {
+                let number = next.fetch_add(1, Ordering::Relaxed);
+                let Some(corner) = chunks.get(number) else { break };
+                if self.before.contains(&(number as u32)) {
+                    continue;
+                }
+                let chunk = self.chunk(number as u32, *corner, coarse);
+                self.finish(chunk).inspect_err(|_| failed.store(true, Ordering::Relaxed))?;
+                self.work.progress.advance(cells);
             }
             Ok(())
-        })
+        });
+        if let Err(error) = worked
+            && !matches!(error, BuildError::Interrupted { .. })
+        {
+            // What is done may still be kept; the first failure is the one to tell.
+            let _ = self.work.checkpoint(&self.canvas);
+            return Err(error);
+        }
+        if self.done.load(Ordering::Relaxed) < all {
+            self.work.checkpoint(&self.canvas)?;
+            return Err(self.interrupted());
+        }
+        Ok(())
+    }
+
+    /// Tallies a chunk and notes it in the journal.
+    fn finish(&self, chunk: Result<Chunk, BuildError>) -> Result<(), BuildError> {
+        let chunk = chunk?;
+        let mut tallies = self.tallies.lock().unwrap_or_else(PoisonError::into_inner);
+        tallies.add(&self.plan.forest, &chunk);
+        drop(tallies);
+        self.done.fetch_add(1, Ordering::Relaxed);
+        if self.work.journal.note(&Record::Chunk(chunk)) {
+            self.work.checkpoint(&self.canvas)?;
+        }
+        Ok(())
     }
 
     /// Codes the diamonds that a chunk owns and compares its samples with the surface of every level.
-    fn chunk(&self, corner: [u32; 2], coarse: &Coarse) -> Result<(), BuildError> {
+    fn chunk(&self, number: u32, corner: [u32; 2], coarse: &Coarse) -> Result<Chunk, BuildError> {
         let forest = &self.plan.forest;
         let side = 1u32 << self.plan.chunks.side_log2();
         let cells = [side, side];
         let far = corner.map(|w| w + side);
+        let mut chunk = Chunk { number, ..Chunk::default() };
         // Beyond the source there is nothing, but for what straddles the border by half a chunk.
         if corner[0] > self.grid.width + side || corner[1] > self.grid.height + side {
-            return Ok(());
+            return Ok(chunk);
         }
-        let samples = self.canvas.read(0, corner, far).map_err(self.work())?;
-        let (ranges, surfaces) = self.chunk_diamonds(corner, coarse)?;
+        let window = self.canvas.read(0, corner, far).map_err(self.work.failure())?;
+        let samples = Samples::new(corner, cells, window.heights());
         let mut found = HashMap::new();
-        let mut finest = 0.0f64;
+        let own = self.plan.chunks.level();
         if !samples.is_empty() {
-            let heights: Vec<i32> = samples.rows().flatten().copied().collect();
-            let samples = Samples { origin: corner, cells, heights: &heights };
-            let coarse_levels =
-                coarse.surfaces.iter().take(self.plan.chunks.level() as usize + 1).enumerate();
-            for (level, surface) in coarse_levels.skip(1) {
-                measure(forest, level as u32, samples, |x, y| surface.at(x, y), &mut found);
-            }
-            let first = self.plan.chunks.level() + 1;
-            for (level, surface) in (first..forest.levels()).zip(&surfaces) {
-                measure(forest, level, samples, |x, y| surface.at(x, y), &mut found);
-            }
-            if let Some(last) = surfaces.last() {
-                let worst = last
-                    .heights
-                    .iter()
-                    .zip(&heights)
-                    .filter(|(_, s)| **s != NODATA)
-                    .map(|(h, s)| h.abs_diff(*s))
-                    .max();
-                finest = f64::from(worst.unwrap_or(0));
+            for (level, surface) in coarse.surfaces.iter().enumerate().take(own as usize + 1).skip(1) {
+                measure(forest, level as u32, &samples, surface.nodes(), &mut found);
             }
         }
-        let mut tallies = self.tallies.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        tallies.ranges.extend(ranges);
-        for (d, here) in found {
-            tallies.found.entry(d).or_default().merge(here);
+        let mut before: HashMap<Diamond, Block> = HashMap::new();
+        for (level, diamonds) in (own..).zip(&self.plan.chunks.needed(corner)) {
+            let mut surface = Surface::new(self.plan.spacing_log2(level + 1), corner, cells);
+            before = self.chunk_level(level, diamonds, &before, &mut surface, coarse, &mut chunk)?;
+            if samples.is_empty() {
+                continue;
+            }
+            if level + 1 < forest.levels() {
+                measure(forest, level + 1, &samples, surface.nodes(), &mut found);
+            } else {
+                chunk.finest = finest(&surface, window.heights());
+            }
         }
-        tallies.finest = tallies.finest.max(finest);
-        Ok(())
+        chunk.found = found.into_iter().map(|(d, here): (_, Found)| (d.centre(), here)).collect();
+        Ok(chunk)
     }
 
-    /// The diamonds of a chunk, level by level: ranges of those that it owns, and the surfaces of the
-    /// levels below the chunk's own, over the chunk.
-    #[allow(
-        clippy::type_complexity,
-        reason = "two results of one pass, taken apart at once by the only caller"
-    )]
-    fn chunk_diamonds(
+    /// Codes the diamonds of one level of a chunk, those that it owns for good, and draws all. Their blocks.
+    fn chunk_level(
         &self,
-        corner: [u32; 2],
+        level: u32,
+        diamonds: &BTreeSet<Diamond>,
+        before: &HashMap<Diamond, Block>,
+        surface: &mut Surface,
         coarse: &Coarse,
-    ) -> Result<(Vec<(Diamond, Coded)>, Vec<Surface>), BuildError> {
+        chunk: &mut Chunk,
+    ) -> Result<HashMap<Diamond, Block>, BuildError> {
         let forest = &self.plan.forest;
-        let side = 1u32 << self.plan.chunks.side_log2();
-        let needed = self.plan.chunks.needed(corner);
-        let (mut ranges, mut surfaces) = (Vec::new(), Vec::new());
-        let mut before: HashMap<Diamond, Block> = HashMap::new();
-        for (level, diamonds) in (self.plan.chunks.level()..).zip(&needed) {
-            let spacing = self.plan.spacing_log2(level + 1);
-            let bounds = diamonds.iter().map(|d| forest.bounds(*d)).reduce(|[a, b], [c, d]| {
-                [[a[0].min(c[0]), a[1].min(c[1])], [b[0].max(d[0]), b[1].max(d[1])]]
-            });
-            let Some([low, high]) = bounds else { continue };
-            let window = self.canvas.read(spacing, low, high).map_err(self.work())?;
-            let mut surface = Surface::new(spacing, corner, [side, side]);
-            let mut here = HashMap::new();
-            for d in diamonds {
-                let mut block = inherited(forest, &before, *d);
-                if level == self.plan.chunks.level() && level > 0 {
-                    // The chunks' own level starts from what the coarse levels left.
-                    if let Some(last) = coarse.surfaces.last() {
-                        let mut whole = Block::empty(forest);
-                        whole.fill(&forest.local(*d), |x, y| {
-                            let on_lattice = (x | y).trailing_zeros() >= last.spacing_log2;
-                            if on_lattice { last.at(x, y) } else { NODATA }
-                        });
-                        block.parts_mut().0.copy_from_slice(whole.parts().0);
-                    }
-                }
-                let source = self.source_block(*d, &window);
-                if self.plan.chunks.owns(corner, *d) {
-                    ranges.push(self.code(*d, &mut block, &source)?);
-                } else {
-                    points::quantise(forest, &self.coding, *d, &mut block, &source);
-                }
-                surface.draw(forest, *d, &block, [side, side]);
-                here.insert(*d, block);
+        let (side, corner) = (1u32 << self.plan.chunks.side_log2(), surface.origin());
+        let mut here = HashMap::with_capacity(diamonds.len());
+        let Some([low, high]) = bounds(forest, diamonds) else { return Ok(here) };
+        let spacing = self.plan.spacing_log2(level + 1);
+        let window = self.canvas.read(spacing, low, high).map_err(self.work.failure())?;
+        for d in diamonds {
+            if self.work.progress.is_out_of_patience() {
+                return Err(self.interrupted());
             }
-            before = here;
-            surfaces.push(surface);
+            let mut block = inherited(forest, before, *d);
+            if level == self.plan.chunks.level() && level > 0 {
+                take_over(forest, *d, coarse, &mut block);
+            }
+            let source = source_block(forest, *d, &window);
+            if self.plan.chunks.owns(corner, *d) {
+                chunk.coded.push(self.code(*d, &mut block, &source)?);
+            } else {
+                points::quantise(forest, &self.coding, *d, &mut block, &source);
+            }
+            surface.draw(forest, *d, &block, [side, side]);
+            here.insert(*d, block);
         }
-        Ok((ranges, surfaces))
+        Ok(here)
     }
+}
+
+/// The old points of a diamond of the chunks' own level, which starts from what the coarse levels left.
+fn take_over(forest: &Forest, d: Diamond, coarse: &Coarse, block: &mut Block) {
+    let Some(last) = coarse.surfaces.last() else { return };
+    let mut whole = Block::empty(forest);
+    whole.fill(&forest.local(d), |x, y| {
+        let on_lattice = (x | y).trailing_zeros() >= last.spacing_log2;
+        if on_lattice { last.at(x, y) } else { NODATA }
+    });
+    block.parts_mut().0.copy_from_slice(whole.parts().0);
+}
+
+/// The largest distance between the finest level and the samples, in quanta.
+fn finest(surface: &Surface, heights: &[i32]) -> f64 {
+    let both = surface.heights.iter().zip(heights).filter(|(_, sample)| **sample != NODATA);
+    both.map(|(drawn, sample)| drawn.abs_diff(*sample)).max().unwrap_or(0).into()
 }
 
 /// The block of a diamond with the old points that its parents leave.
@@ -219,4 +244,13 @@ fn inherited(forest: &Forest, before: &HashMap<Diamond, Block>, d: Diamond) -> B
         }
     }
     block
+}
+
+impl Coded {
+    /// What coding a diamond gave.
+    pub(super) fn new(d: Diamond, block: &Block, source: &Block, spot: Option<crate::store::Spot>) -> Self {
+        let all = block.heights().iter().chain(source.heights()).filter(|h| **h != NODATA);
+        let (low, high) = all.fold((i32::MAX, i32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+        Self { centre: d.centre(), low, high, spot }
+    }
 }

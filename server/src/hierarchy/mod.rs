@@ -10,15 +10,21 @@
 //!    computed on both sides (from the same numbers, so with the same result) and written by their owner.
 //! 4. **Index.** Errors and ranges are saturated from the finest level up, pages written, all published.
 //!
+//! What is done is noted in a `journal`; a build that was killed goes on from there.
+//!
 //! Everything written is a function of the source and the options, whatever the number of threads.
 
 mod coding;
 mod error;
+mod estimate;
 mod index;
+mod journal;
 mod levels;
 mod plan;
 mod surface;
+mod tallies;
 mod transcribe;
+mod work;
 
 use crate::canvas::Canvas;
 use crate::ingest::{Grid, Source};
@@ -28,14 +34,19 @@ use coding::fine_step;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::message::{Crs, Frame, Kind, Scene};
 use diamantina_protocol::points::{Coding, Rule};
-use levels::Tallies;
+use index::Sums;
 use plan::Plan;
-use std::io;
+use std::collections::HashSet;
 use std::path::Path;
-use std::sync::Mutex;
-use transcribe::transcribe;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+use tallies::Tallies;
+use transcribe::{Stats, find_quantum, transcribe};
+use work::Work;
 
 pub use error::BuildError;
+pub use estimate::{Estimate, estimate};
 
 /// What a build may be told.
 #[derive(Debug, Clone)]
@@ -56,7 +67,14 @@ pub struct Options {
     pub patch_log2: u8,
     /// The most memory that the build may take, in bytes.
     pub memory: u64,
+    /// Whether to begin anew even where an interrupted build could be gone on with.
+    pub fresh: bool,
+    /// Between two checkpoints: the most work that a kill costs.
+    pub checkpoint: Duration,
 }
+
+/// Between two checkpoints, unless told otherwise. Syncing more often would cost more than a kill does.
+pub const CHECKPOINT: Duration = Duration::from_secs(5);
 
 /// What a build did.
 #[derive(Debug, Clone, serde::Serialize)]
@@ -81,57 +99,110 @@ pub struct Report {
 
 /// Builds a scene of one layer from a source and publishes it at `out`.
 ///
+/// What an earlier run of the same build left in the work folder is gone on with; the bytes are those of an
+/// unbroken build. `progress` says when to stop.
+///
 /// # Errors
-/// When the source or the disk fails, or the options do not fit the source. The store at `out`, if there
-/// was one, is then untouched.
+/// When the source or the disk fails, the options do not fit the source, or `progress` was told to stop. The
+/// store at `out`, if there was one, is then untouched. Where the source and the options are not to blame, the
+/// work folder stays, for the same build to go on with.
 pub fn build(
     source: &Source,
     out: &Path,
     options: &Options,
     progress: &Progress,
 ) -> Result<Report, BuildError> {
-    let started = std::time::Instant::now();
+    let started = Instant::now();
     let grid = source.grid();
-    let forest = Forest::covering(grid.width, grid.height, options.patch_log2)
-        .map_err(|error| BuildError::Forest { width: grid.width, height: grid.height, error })?;
-    let writer = Writer::create(out)?;
+    let forest = forest_of(grid, options)?;
+    // Wrong use is refused before an earlier run's work is touched.
     let plan = Plan::new(forest, options.memory)?;
+    let quantum = find_quantum(source, options)?;
+    let writer = Writer::create(out)?;
+    let built = run(source, &writer, options, progress, plan, quantum);
+    progress.finish();
+    match built {
+        Ok((scene, stats, sums)) => Ok(report(grid, scene, &stats, sums, started)),
+        Err(error) => {
+            if error.keeps_work() {
+                writer.keep();
+            }
+            Err(error)
+        }
+    }
+}
 
-    let (canvas, stats) = transcribe(source, &plan, options, writer.work_folder(), progress)?;
+/// The forest that covers a source.
+fn forest_of(grid: &Grid, options: &Options) -> Result<Forest, BuildError> {
+    Forest::covering(grid.width, grid.height, options.patch_log2).map_err(|error| BuildError::Forest {
+        width: grid.width,
+        height: grid.height,
+        error,
+    })
+}
+
+/// Reads, codes, indexes and publishes.
+fn run(
+    source: &Source,
+    writer: &Writer,
+    options: &Options,
+    progress: &Progress,
+    plan: Plan,
+    quantum: f64,
+) -> Result<(Scene, Stats, Sums), BuildError> {
+    let grid = source.grid();
+    let fingerprint = work::fingerprint(source, options, &plan);
+    let (work, canvas, before) = work::open(writer, &plan, grid, &fingerprint, options, progress)?;
+    let stats = transcribe(source, &plan, &canvas, quantum, &before.bands, &work)?;
     let fine_step = fine_step(options.max_error, &stats)?;
     let coding = coding::coding(&plan, &canvas, options.rule, fine_step)?;
-    let build = Build { plan, canvas, coding, writer: &writer, tallies: Mutex::default(), grid };
-
-    let coarse = build.coarse_levels()?;
-    build.chunks(&coarse, progress)?;
-    let layer = build.index(options, &stats)?;
-    let (diamonds, point_bytes, index_bytes) = {
-        let tallies = build.tallies.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        let written = tallies.ranges.values().filter(|r| r.bytes > 0);
-        let points = written.clone().map(|r| u64::from(r.bytes)).sum::<u64>();
-        (written.count() as u64, points, layer.bytes - points)
+    let build = Build {
+        plan,
+        canvas,
+        coding,
+        work: &work,
+        tallies: Mutex::new(before.tallies),
+        done: AtomicU64::new(before.chunks.len() as u64),
+        before: before.chunks,
+        grid,
     };
-    drop(build);
-    progress.stage("publish", 0);
+    let coarse = build.coarse_levels()?;
+    build.chunks(&coarse)?;
+    drop(coarse);
+    let tallies = build.tallies.lock().unwrap_or_else(PoisonError::into_inner).take();
+    let (layer, sums) = build.index(tallies, options, &stats)?;
+    progress.stage("publish", "bytes", layer.bytes, 0);
+    let scene = Scene {
+        name: options.scene.clone(),
+        version: String::new(),
+        frame: frame(grid),
+        layers: vec![layer],
+        zones: Vec::new(),
+    };
+    let go_on = |bytes| {
+        progress.advance(bytes);
+        !progress.is_stopping()
+    };
+    let scene = writer.publish(scene, go_on)?.ok_or_else(|| build.interrupted())?;
+    Ok((scene, stats, sums))
+}
+
+/// The frame of a source's grid.
+fn frame(grid: &Grid) -> Frame {
     let crs = grid.crs.as_ref().map(|crs| {
         let per_metre = [crs.step[0] / grid.cell[0], crs.step[1] / grid.cell[1]];
         let origin =
             [crs.origin[0] - grid.origin[0] * per_metre[0], crs.origin[1] - grid.origin[1] * per_metre[1]];
         Crs { name: crs.name.clone(), proj4: crs.proj4.clone(), origin, per_metre }
     });
-    let frame = Frame { crs, vertical_unit: "metre".to_owned() };
-    let scene = Scene {
-        name: options.scene.clone(),
-        version: String::new(),
-        frame,
-        layers: vec![layer],
-        zones: Vec::new(),
-    };
-    let scene = writer.publish(scene)?;
-    progress.finish();
+    Frame { crs, vertical_unit: "metre".to_owned() }
+}
+
+fn report(grid: &Grid, scene: Scene, stats: &Stats, sums: Sums, started: Instant) -> Report {
     let samples = u64::from(grid.width) * u64::from(grid.height);
     let seconds = started.elapsed().as_secs_f64();
-    Ok(Report {
+    let Sums { diamonds, point_bytes, index_bytes } = sums;
+    Report {
         scene,
         samples,
         diamonds,
@@ -140,7 +211,7 @@ pub fn build(
         bits_per_sample: point_bytes as f64 * 8.0 / stats.valid as f64,
         seconds,
         msamples_per_second: samples as f64 / seconds / 1e6,
-    })
+    }
 }
 
 /// A build under way.
@@ -148,14 +219,17 @@ struct Build<'a> {
     plan: Plan,
     canvas: Canvas,
     coding: Coding,
-    writer: &'a Writer,
+    work: &'a Work<'a>,
     tallies: Mutex<Tallies>,
+    /// Chunks that earlier runs have done.
+    before: HashSet<u32>,
+    /// How many are done by now.
+    done: AtomicU64,
     grid: &'a Grid,
 }
 
 impl Build<'_> {
-    fn work(&self) -> impl Fn(io::Error) -> BuildError {
-        let path = self.canvas.folder().to_owned();
-        move |error| BuildError::Work { path: path.clone(), error }
+    fn interrupted(&self) -> BuildError {
+        BuildError::Interrupted { done: self.done.load(Ordering::Relaxed), chunks: self.work.chunks }
     }
 }

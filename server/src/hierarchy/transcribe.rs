@@ -6,16 +6,15 @@
     reason = "coordinates of the source are 32-bit, and heights are checked against the range of quanta before they become integers"
 )]
 
+use super::journal::{Band, Record};
 use super::plan::Plan;
-use super::{BuildError, Options};
+use super::{BuildError, Options, Work};
 use crate::canvas::Canvas;
-use crate::ingest::Source;
-use crate::progress::Progress;
+use crate::ingest::{Grid, Source};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::points::SOURCE_MAX;
 use rayon::prelude::*;
-use std::io;
-use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// What the transcription found.
 #[derive(Debug, Clone, Copy)]
@@ -41,7 +40,7 @@ fn power_of_ten(value: f64) -> f64 {
 
 /// A quantum for heights that are not whole numbers: their own decimal step if they have one, else a
 /// power of ten of about 1/65536 of the range; coarser where the asked error allows it.
-fn find_quantum(source: &Source, options: &Options) -> Result<f64, BuildError> {
+pub(super) fn find_quantum(source: &Source, options: &Options) -> Result<f64, BuildError> {
     let grid = source.grid();
     let scale = grid.height_scale.abs();
     if let Some(quantum) = options.quantum {
@@ -101,66 +100,134 @@ fn is_outlier(heights: &mut Vec<f64>, quantum: f64) -> bool {
     rest.first().zip(rest.last()).is_some_and(|(low, high)| high - low < 256.0 * quantum)
 }
 
-/// Reads the whole source into a canvas of quanta.
+/// Reads the source into the canvas, but for the rows of `done`, and says what all rows hold.
 pub(super) fn transcribe(
     source: &Source,
     plan: &Plan,
-    options: &Options,
-    folder: &Path,
-    progress: &Progress,
-) -> Result<(Canvas, Stats), BuildError> {
+    canvas: &Canvas,
+    quantum: f64,
+    done: &[Band],
+    work: &Work<'_>,
+) -> Result<Stats, BuildError> {
     let grid = source.grid();
-    let quantum = find_quantum(source, options)?;
-    let work = |error: io::Error| BuildError::Work { path: folder.to_owned(), error };
-    let coarsest = plan.spacing_log2(plan.chunks.level());
-    let canvas = Canvas::create(folder, grid.width, grid.height, coarsest).map_err(work)?;
     let rows = (plan.band_bytes / 16 / u64::from(grid.width)).clamp(1, 256) as u32;
-    progress.stage("read", u64::from(grid.width) * u64::from(grid.height));
-    let bands: Vec<u32> = (0..grid.height).step_by(rows as usize).collect();
-    let per_value = grid.height_scale / quantum;
-    let stats = bands
+    let before: u64 = done.iter().map(|b| u64::from(b.rows)).sum();
+    let width = u64::from(grid.width);
+    work.progress.stage("read", "samples", width * u64::from(grid.height), width * before);
+    let failed = AtomicBool::new(false);
+    let read = missing(grid.height, done, rows)
         .into_par_iter()
-        .map(|y0| {
-            let count = rows.min(grid.height - y0);
-            let mut values = Vec::new();
-            source.read(0, y0, grid.width, count, &mut values)?;
-            let mut stats = Stats { quantum, low: i32::MAX, high: i32::MIN, valid: 0, rounding: 0.0 };
-            let mut heights = Vec::with_capacity(values.len());
-            for value in &values {
-                if value.is_nan() {
-                    heights.push(NODATA);
-                    continue;
-                }
-                let exact = value * per_value;
-                let rounded = exact.round();
-                if rounded.abs() > f64::from(SOURCE_MAX) {
-                    return Err(BuildError::Range { value: value * grid.height_scale, quantum });
-                }
-                let height = rounded as i32;
-                stats.low = stats.low.min(height);
-                stats.high = stats.high.max(height);
-                stats.valid += 1;
-                stats.rounding = stats.rounding.max((exact - rounded).abs() * quantum);
-                heights.push(height);
+        .map(|(y0, count)| {
+            // Whoever fails stops the others at their next band.
+            if work.progress.is_stopping() || failed.load(Ordering::Relaxed) {
+                return Ok(None);
             }
-            canvas.write_rows(y0, &heights).map_err(work)?;
-            progress.advance(values.len() as u64);
-            Ok(stats)
+            let band = read_band(source, canvas, quantum, y0, count, work)
+                .inspect_err(|_| failed.store(true, Ordering::Relaxed))?;
+            if work.journal.note(&Record::Band(band)) {
+                work.checkpoint(canvas)?;
+            }
+            work.progress.advance(u64::from(count) * width);
+            Ok(Some(band))
         })
-        .try_reduce(
-            || Stats { quantum, low: i32::MAX, high: i32::MIN, valid: 0, rounding: 0.0 },
-            |a, b| {
-                Ok(Stats {
-                    quantum,
-                    low: a.low.min(b.low),
-                    high: a.high.max(b.high),
-                    valid: a.valid + b.valid,
-                    rounding: a.rounding.max(b.rounding),
-                })
-            },
-        )?;
-    if stats.valid == 0 {
-        return Err(BuildError::AllNodata(u64::from(grid.width) * u64::from(grid.height)));
+        .collect::<Result<Vec<_>, BuildError>>();
+    let read = match read {
+        Ok(read) => read,
+        Err(error) => {
+            // What is done may still be kept; the first failure is the one to tell.
+            let _ = work.checkpoint(canvas);
+            return Err(error);
+        }
+    };
+    if read.contains(&None) {
+        work.checkpoint(canvas)?;
+        return Err(BuildError::Interrupted { done: 0, chunks: work.chunks });
     }
-    Ok((canvas, stats))
+    let mut stats = Stats { quantum, low: i32::MAX, high: i32::MIN, valid: 0, rounding: 0.0 };
+    for band in done.iter().chain(read.iter().flatten()) {
+        stats.low = stats.low.min(band.low);
+        stats.high = stats.high.max(band.high);
+        stats.valid += band.valid;
+        stats.rounding = stats.rounding.max(band.rounding);
+    }
+    if stats.valid == 0 {
+        return Err(BuildError::AllNodata(width * u64::from(grid.height)));
+    }
+    Ok(stats)
+}
+
+/// The rows that are not done, in bands of at most `rows`: first row and number.
+fn missing(height: u32, done: &[Band], rows: u32) -> Vec<(u32, u32)> {
+    let mut done: Vec<_> = done.iter().map(|b| (b.y0, b.y0.saturating_add(b.rows))).collect();
+    done.push((height, height));
+    done.sort_unstable();
+    let (mut bands, mut next) = (Vec::new(), 0);
+    for (from, to) in done {
+        while next < from {
+            let count = rows.min(from - next);
+            bands.push((next, count));
+            next += count;
+        }
+        next = next.max(to);
+    }
+    bands
+}
+
+/// Reads `count` rows from row `y0` into the canvas.
+fn read_band(
+    source: &Source,
+    canvas: &Canvas,
+    quantum: f64,
+    y0: u32,
+    count: u32,
+    work: &Work<'_>,
+) -> Result<Band, BuildError> {
+    let grid = source.grid();
+    let mut values = Vec::new();
+    source.read(0, y0, grid.width, count, &mut values)?;
+    let (heights, stats) = to_quanta(&values, grid, quantum)?;
+    drop(values);
+    canvas.write_rows(y0, &heights).map_err(work.failure())?;
+    let Stats { low, high, valid, rounding, .. } = stats;
+    Ok(Band { y0, rows: count, low, high, valid, rounding })
+}
+
+/// Source values as whole numbers of quanta, and what was found in them.
+pub(super) fn to_quanta(values: &[f64], grid: &Grid, quantum: f64) -> Result<(Vec<i32>, Stats), BuildError> {
+    let per_value = grid.height_scale / quantum;
+    let mut stats = Stats { quantum, low: i32::MAX, high: i32::MIN, valid: 0, rounding: 0.0 };
+    let mut heights = Vec::with_capacity(values.len());
+    for value in values {
+        if value.is_nan() {
+            heights.push(NODATA);
+            continue;
+        }
+        let exact = value * per_value;
+        let rounded = exact.round();
+        if rounded.abs() > f64::from(SOURCE_MAX) {
+            return Err(BuildError::Range { value: value * grid.height_scale, quantum });
+        }
+        let height = rounded as i32;
+        stats.low = stats.low.min(height);
+        stats.high = stats.high.max(height);
+        stats.valid += 1;
+        stats.rounding = stats.rounding.max((exact - rounded).abs() * quantum);
+        heights.push(height);
+    }
+    Ok((heights, stats))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_missing_is_what_no_band_has() {
+        let band = |y0, rows| Band { y0, rows, low: 0, high: 0, valid: 0, rounding: 0.0 };
+        assert_eq!(missing(10, &[], 4), [(0, 4), (4, 4), (8, 2)]);
+        assert_eq!(missing(10, &[band(4, 2), band(0, 1)], 4), [(1, 3), (6, 4)]);
+        assert_eq!(missing(10, &[band(0, 5), band(5, 5)], 4), []);
+        // Bands of a run with other threads overlap, if at all, harmlessly.
+        assert_eq!(missing(6, &[band(0, 4), band(2, 3)], 4), [(5, 1)]);
+    }
 }

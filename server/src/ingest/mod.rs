@@ -32,7 +32,7 @@ mod usgs_dem;
 use std::fmt;
 use std::fs::File;
 use std::num::NonZeroU32;
-use std::os::unix::fs::FileExt;
+use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;
@@ -195,6 +195,7 @@ pub struct Crs {
 /// TIFF strip or tile, and at most 128 MiB of decoded ones for the whole layer.
 pub struct Source {
     grid: Grid,
+    identity: String,
     mosaic: Mosaic,
     reprojection: Option<Reprojection>,
 }
@@ -224,10 +225,29 @@ pub fn open(paths: &[PathBuf], options: &Options) -> std::result::Result<Source,
     let mosaic = Mosaic::new(rasters)?;
     let (grid, reprojection) = frame(first, &mosaic, options)?;
     check_grid(first, &grid)?;
-    Ok(Source { grid, mosaic, reprojection })
+    let identity = identity(paths, options, &grid)?;
+    Ok(Source { grid, identity, mosaic, reprojection })
+}
+
+/// What tells this source from others without reading it.
+fn identity(paths: &[PathBuf], options: &Options, grid: &Grid) -> Result<String> {
+    let mut files = Vec::with_capacity(paths.len());
+    for path in paths {
+        let whole = path.canonicalize().map_err(io_error(path, "find it"))?;
+        let about = whole.metadata().map_err(io_error(path, "ask for its length"))?;
+        files.push((whole, about.len(), about.mtime(), about.mtime_nsec()));
+    }
+    Ok(format!("{files:?} {options:?} {grid:?}"))
 }
 
 impl Source {
+    /// A text that is the same for the same files (paths, lengths, times of change) read with the same
+    /// options, and for no others.
+    #[must_use]
+    pub fn identity(&self) -> &str {
+        &self.identity
+    }
+
     /// The lattice that windows refer to.
     #[must_use]
     pub fn grid(&self) -> &Grid {
