@@ -330,7 +330,7 @@ fn what_is_no_store_is_refused() {
     std::fs::create_dir(folder.join("bare")).unwrap();
     let scene = std::fs::read_to_string(folder.join("store/scene.json")).unwrap();
     std::fs::create_dir(folder.join("newer")).unwrap();
-    std::fs::write(folder.join("newer/scene.json"), scene.replacen("\"format\": 1", "\"format\": 2", 1))
+    std::fs::write(folder.join("newer/scene.json"), scene.replacen("\"format\": 2", "\"format\": 3", 1))
         .unwrap();
     std::fs::create_dir(folder.join("text")).unwrap();
     std::fs::write(folder.join("text/scene.json"), "not JSON").unwrap();
