@@ -262,7 +262,13 @@ fn every_prefix_covers_the_forest_once_without_cracks() {
     let [low, high] = [layer.position([0, 0]), layer.position(layer.forest.size())];
     let eye = DVec3::new((low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, 60_000.0);
     let camera = Camera { eye, target: eye - DVec3::Z, fov_y: 2.7, size: [1380, 768] };
-    let ask = Ask { layer: &layer, camera: &camera, tolerance_pixels: 1e-9, splits_max: usize::MAX };
+    let ask = Ask {
+        layer: &layer,
+        camera: &camera,
+        exaggeration: 1.0,
+        tolerance_pixels: 1e-9,
+        splits_max: usize::MAX,
+    };
     let ideal = cut::choose(&ask, |d| Some(entries[&d]));
     for question in questions(&layer) {
         let (mut stream, mut reader, mut shared) = (stream(&place, &question), Reader::new(&layer), 0);

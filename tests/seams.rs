@@ -150,6 +150,7 @@ fn any_cut_of_a_built_store_with_anything_missing_has_no_cracks() {
             let ask = Ask {
                 layer: &layer,
                 camera: &camera,
+                exaggeration: 1.0,
                 tolerance_pixels: 0.005 * 300f64.powf(dice.roll()),
                 splits_max: if round % 7 == 6 { 40 } else { usize::MAX },
             };

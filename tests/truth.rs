@@ -17,6 +17,7 @@ use diamantina_server::{hierarchy, ingest, inspect};
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::io::Write;
+use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -295,7 +296,10 @@ fn dems(folder: &Path) -> Vec<(PathBuf, ingest::Options)> {
         .filter(|fields| !fields[4].is_empty() && !fields[4].contains("x3"))
         .map(|fields| {
             let cell = fields[0].ends_with(".png").then_some(30.0);
-            let ingest = ingest::Options { crs: CrsChoice::Source, cell, ..ingest::Options::default() };
+            // Degrees, though the file does not say so.
+            let assume_crs = fields[0].contains("hilo").then(|| NonZeroU32::new(4326)).flatten();
+            let ingest =
+                ingest::Options { crs: CrsChoice::Source, cell, assume_crs, ..ingest::Options::default() };
             (folder.join(fields[0]), ingest)
         })
         .collect()

@@ -110,6 +110,8 @@ pub(crate) fn options() -> hierarchy::Options {
         quantum: None,
         patch_log2: 6,
         memory: 2 << 30,
+        fresh: false,
+        checkpoint: hierarchy::CHECKPOINT,
     }
 }
 

@@ -187,6 +187,14 @@ impl<E: std::error::Error> From<E> for Failure {
     }
 }
 
+/// What became of printing results. That nobody reads any more, as behind `| head`, is no failure.
+fn shown(printed: std::io::Result<()>) -> std::io::Result<()> {
+    match printed {
+        Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        other => other,
+    }
+}
+
 fn main() -> ExitCode {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| "warn,wgpu_hal=error,wgpu_core=error".into());
@@ -224,7 +232,7 @@ impl ViewArgs {
             Encoding::Points => terrain::ENCODING.to_owned(),
         };
         let options = terrain::Options {
-            tolerance_pixels: headless::tolerance(self.error_pixels, self.exaggeration),
+            tolerance_pixels: self.error_pixels,
             memory_bytes: self.memory << 20,
             encoding,
             ..terrain::Options::default()
@@ -292,11 +300,11 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
     headless::save(&picture, &args.output)?;
     if let Some(path) = &args.json {
         let mut out = headless::open_text(path)?;
-        writeln!(out, "{}", serde_json::to_string_pretty(&report)?)?;
-        out.flush()?;
+        let printed = writeln!(out, "{}", serde_json::to_string_pretty(&report)?);
+        shown(printed.and_then(|()| out.flush()))?;
     }
     if args.json.as_ref().is_none_or(|p| p.as_os_str() != "-") {
-        print_report(args, &report)?;
+        shown(print_report(args, &report))?;
     }
     if report.complete {
         return Ok(());
@@ -346,7 +354,15 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
         writeln!(out, "{}", FrameLine::HEADING)?;
     }
     if let Some(folder) = &args.pictures {
-        std::fs::create_dir_all(folder).map_err(|e| Failure(1, format!("{}: {e}", folder.display())))?;
+        std::fs::create_dir_all(folder).map_err(|e| {
+            Failure(
+                1,
+                format!(
+                    "{}: cannot create the folder: {e}; choose another with --pictures",
+                    folder.display()
+                ),
+            )
+        })?;
     }
     let flight = Flight {
         frames: args.frames,
@@ -375,7 +391,7 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
         out.flush()?;
     }
     if let Some(error) = failed {
-        return Err(error.into());
+        return Ok(shown(Err(error))?);
     }
     if let Some(last) = last.filter(|_| args.csv.as_ref().is_none_or(|p| p.as_os_str() != "-")) {
         let mut out = std::io::stdout().lock();

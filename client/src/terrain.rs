@@ -13,7 +13,7 @@
 //! themselves, so a whole branch that arrived in one answer is decoded between two frames.
 
 use crate::cache::{Cache, Index, Key, PAGES_MAX};
-use crate::camera::Camera;
+use crate::camera::{Camera, Plane};
 use crate::cut::{self, Ask, Ideal, Wish};
 use crate::drawing::DrawItem;
 use crate::fetch::{self, Event, FetchError, Fetcher, ROOT_BYTES, Traffic, Want};
@@ -23,6 +23,7 @@ use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::message::{Layer, Scene, StreamAsk, StreamView};
 use diamantina_protocol::points::DecodeError;
 use foldhash::fast::RandomState;
+use glam::DVec3;
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
@@ -52,6 +53,8 @@ pub const ENCODING: &str = "points";
 pub struct Options {
     /// The error to reach, in pixels.
     pub tolerance_pixels: f64,
+    /// What heights are multiplied by, and errors with them.
+    pub exaggeration: f64,
     /// Memory for surfaces, in bytes. What the cut wants takes at most three quarters of it: where that is
     /// too little for the tolerance, the largest errors are reduced first.
     pub memory_bytes: usize,
@@ -65,6 +68,7 @@ impl Default for Options {
     fn default() -> Self {
         Self {
             tolerance_pixels: 1.0,
+            exaggeration: 1.0,
             memory_bytes: 512 << 20,
             encoding: ENCODING.to_owned(),
             fetch: fetch::Options::default(),
@@ -95,7 +99,9 @@ pub enum TerrainError {
     #[error("tolerance of {0} pixels: expected a number above 0")]
     Tolerance(f64),
     /// No threads.
-    #[error("cannot start a decoding thread: {0}")]
+    #[error(
+        "cannot start a decoding thread: {0}: close other programs, or raise the limit on threads (ulimit -u)"
+    )]
     Thread(#[from] std::io::Error),
 }
 
@@ -138,7 +144,8 @@ pub struct FrameView {
     /// The triangles to draw; together they cover whatever of the scene is in view, once all roots are
     /// there.
     pub items: Vec<DrawItem>,
-    /// The largest declared error of what is drawn, in pixels; infinite while a layer lacks a root.
+    /// The largest declared error of what is drawn, in pixels, as it looks from no nearer than the near plane;
+    /// infinite while a layer lacks a root.
     pub error_pixels: f64,
     /// The same, once all that the ideal cut wants has arrived, as far as the index tells already.
     pub error_pixels_goal: f64,
@@ -260,22 +267,35 @@ impl Terrain {
         }
     }
 
+    /// Sets what heights are multiplied by; what is no number above 0 changes nothing.
+    pub fn set_exaggeration(&mut self, exaggeration: f64) {
+        if exaggeration > 0.0 && exaggeration.is_finite() {
+            self.options.exaggeration = exaggeration;
+        }
+    }
+
     /// Asks for all that a view needs in one request a layer, the largest errors first: on the way, each frame
     /// draws what is there, and once it has ended, frames ask for what is still missing. It is dropped where
-    /// most of it turns out not to be wanted.
+    /// most of it turns out not to be wanted. The camera is as for [`Terrain::frame`].
     pub fn stream(&mut self, camera: &Camera) {
         // A little less than the tolerance, for the rounding of both ends.
         let angle = self.options.tolerance_pixels / camera.pixels_per_radian() * (1.0 - 1e-9);
-        let sides = camera.planes().iter().map(|plane| plane.normal.to_array()).collect();
-        let view = StreamView { eye: camera.eye.to_array(), angle, sides };
+        // The server knows heights as they are: the same view, from where a camera of such heights would be.
+        // Where heights are exaggerated it asks for no more than the cut wants, which asks for the rest.
+        let exaggeration = self.options.exaggeration;
+        let flat = |plane: &Plane| (plane.normal * DVec3::new(1.0, 1.0, exaggeration)).normalize().to_array();
+        let sides = camera.planes().iter().map(flat).collect();
+        let eye = camera.eye.with_z(camera.eye.z / exaggeration).to_array();
+        let view = StreamView { eye, angle, sides };
         for layer in 0..self.layers.len() {
             self.fetcher.stream(layer, StreamAsk { view: Some(view.clone()), ..StreamAsk::default() });
         }
         self.strays = 0;
     }
 
-    /// Takes in what has arrived, says what to draw, and asks for what is missing. Never waits; takes
-    /// about a microsecond for each diamond that the cut looks at.
+    /// Takes in what has arrived, says what to draw, and asks for what is missing. The camera's heights are
+    /// multiplied, if those of the terrain are. Never waits; takes about a microsecond for each diamond that
+    /// the cut looks at.
     pub fn frame(&mut self, camera: &Camera) -> FrameView {
         let started = Instant::now();
         self.take_decoded();
@@ -287,6 +307,7 @@ impl Terrain {
             let ask = Ask {
                 layer: &self.scene.layers[number],
                 camera,
+                exaggeration: self.options.exaggeration,
                 tolerance_pixels: self.options.tolerance_pixels,
                 splits_max: state.splits_max,
             };
@@ -623,7 +644,6 @@ impl Bench {
 mod tests {
     use super::*;
     use crate::world::{Dice, Faults, Served, above, any_camera, world};
-    use glam::DVec3;
 
     const MINUTE: Duration = Duration::from_secs(60);
 

@@ -269,7 +269,23 @@ impl Block {
     /// Both parents together give a child all its old points; those on the shared hypotenuse come from
     /// either, and are equal, since no split moves its own border.
     pub fn inherit(&mut self, forest: &Forest, child: Diamond, parent: Diamond, from: &Self) {
-        walk_shared(forest, child, parent, |to, slot| self.heights[to] = from.heights[slot]);
+        let n = self.n;
+        let shared = Shared::new(forest, child, parent);
+        for j in 0..=n {
+            let (first, last) = shared.columns(n, j);
+            // Along a row, old points of the parent alternate with new ones: each kind lies at even steps.
+            for i in first..=last.min(first + 1) {
+                let [p, q] = shared.at(i, j);
+                let [p2, q2] = shared.at(i + 2, j);
+                let mut slot = Self::slot(n, p as usize, q as usize) as i64;
+                let row = (n + usize::from(p % 2 == 0)) as i64;
+                let step = (q2 - q) / 2 * row + (p2 - p) / 2;
+                for to in self.heights[j * (n + 1) + i..=j * (n + 1) + last].iter_mut().step_by(2) {
+                    *to = from.heights[slot as usize];
+                    slot += step;
+                }
+            }
+        }
     }
 
     /// Reads every point of the block from the lattice: `height(x, y)`. Points outside stay empty.
@@ -286,28 +302,52 @@ impl Block {
     }
 }
 
+/// The triangle that a child takes from a parent, in the local grids of both.
+struct Shared {
+    /// The child's (0, 0) in the parent's doubled coordinates, and what a step along the child's u and v adds.
+    origin: [i64; 2],
+    u: [i64; 2],
+    v: [i64; 2],
+    /// Whether it is the child's lower triangle.
+    lower: bool,
+}
+
+impl Shared {
+    fn new(forest: &Forest, child: Diamond, parent: Diamond) -> Self {
+        let n = forest.segments() as i64;
+        let (c, p) = (forest.local(child), forest.local(parent));
+        // The child's local grid seen from the parent's: a turn by an odd multiple of 45 degrees.
+        let origin = p.local2(c.origin);
+        let along = |e: [i64; 2]| {
+            let tip = p.local2([c.origin[0] + e[0] * n, c.origin[1] + e[1] * n]);
+            [(tip[0] - origin[0]) / n, (tip[1] - origin[1]) / n]
+        };
+        let centre = [i64::from(parent.x), i64::from(parent.y)];
+        Self { origin, u: along(c.u), v: along(c.v), lower: c.lattice2([2 * n, 0]) == centre }
+    }
+
+    /// The first and last column of a row of the child's old points that lie in the triangle.
+    fn columns(&self, n: usize, row: usize) -> (usize, usize) {
+        if self.lower { (row, n) } else { (0, row) }
+    }
+
+    /// The parent's doubled coordinates of the child's old point (i, j).
+    fn at(&self, i: usize, j: usize) -> [i64; 2] {
+        let (i, j) = (i as i64, j as i64);
+        [self.origin[0] + self.u[0] * i + self.v[0] * j, self.origin[1] + self.u[1] * i + self.v[1] * j]
+    }
+}
+
 /// Calls `copy(slot of the child's old point, slot in the parent's block)` for each point of the
 /// triangle that `child` takes from `parent`.
 pub fn walk_shared(forest: &Forest, child: Diamond, parent: Diamond, mut copy: impl FnMut(usize, usize)) {
     let n = forest.segments();
-    let (c, p) = (forest.local(child), forest.local(parent));
-    // The child's local grid seen from the parent's: a turn by an odd multiple of 45 degrees.
-    let origin = p.local2(c.origin);
-    let along = |e: [i64; 2]| {
-        let tip = p.local2([c.origin[0] + e[0] * n as i64, c.origin[1] + e[1] * n as i64]);
-        [(tip[0] - origin[0]) / n as i64, (tip[1] - origin[1]) / n as i64]
-    };
-    let (u, v) = (along(c.u), along(c.v));
-    let centre = [i64::from(parent.x), i64::from(parent.y)];
-    let lower = c.lattice2([2 * n as i64, 0]) == centre;
+    let shared = Shared::new(forest, child, parent);
     for j in 0..=n {
-        let (from, to) = if lower { (j, n) } else { (0, j) };
-        for i in from..=to {
-            let q = [
-                origin[0] + u[0] * i as i64 + v[0] * j as i64,
-                origin[1] + u[1] * i as i64 + v[1] * j as i64,
-            ];
-            copy(j * (n + 1) + i, Block::slot(n, q[0] as usize, q[1] as usize));
+        let (first, last) = shared.columns(n, j);
+        for i in first..=last {
+            let [p, q] = shared.at(i, j);
+            copy(j * (n + 1) + i, Block::slot(n, p as usize, q as usize));
         }
     }
 }

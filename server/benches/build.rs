@@ -3,16 +3,52 @@
 
 use criterion::{Criterion, Throughput};
 use diamantina_protocol::bintree::Forest;
+use diamantina_protocol::message::Kind;
+use diamantina_protocol::points::Rule;
 use diamantina_server::canvas::Canvas;
-use diamantina_server::measure::{Samples, measure};
+use diamantina_server::measure::{Nodes, Samples, measure};
+use diamantina_server::progress::Progress;
+use diamantina_server::{hierarchy, ingest};
 use std::collections::HashMap;
 use std::hint::black_box;
+use std::path::Path;
 
 const SIDE: u32 = 1024;
 
 fn height(x: u32, y: u32) -> i32 {
     let (x, y) = (f64::from(x), f64::from(y));
     (900.0 * (x / 90.0).sin() * (y / 70.0).cos() + 40.0 * (x / 3.0).cos() + 2000.0) as i32
+}
+
+/// A whole build, disk included.
+fn whole(criterion: &mut Criterion, folder: &Path) {
+    let dem = folder.join("dem.raw");
+    let bytes: Vec<u8> = (0..=SIDE)
+        .flat_map(|y| (0..=SIDE).map(move |x| height(x, SIDE - y) as i16))
+        .flat_map(i16::to_le_bytes)
+        .collect();
+    std::fs::write(&dem, bytes).expect("a disk with room");
+    let shape = format!("{0}x{0}:i16", SIDE + 1).parse().expect("a shape");
+    let ingest = ingest::Options { raw: Some(shape), cell: Some(30.0), ..ingest::Options::default() };
+    let source = ingest::open(&[dem], &ingest).expect("the file just written");
+    let options = hierarchy::Options {
+        scene: "bench".to_owned(),
+        layer: "terrain".to_owned(),
+        kind: Kind::Terrain,
+        max_error: 0.0,
+        rule: Rule::Smooth,
+        quantum: None,
+        patch_log2: 6,
+        memory: 1 << 30,
+        fresh: true,
+        checkpoint: hierarchy::CHECKPOINT,
+    };
+    let mut group = criterion.benchmark_group("build");
+    group.throughput(Throughput::Elements(u64::from(SIDE + 1).pow(2))).sample_size(10);
+    group.bench_function("whole", |b| {
+        b.iter(|| hierarchy::build(&source, &folder.join("store"), &options, &Progress::hidden()));
+    });
+    group.finish();
 }
 
 fn main() {
@@ -27,17 +63,21 @@ fn main() {
     group.bench_function("canvas_read", |b| b.iter(|| canvas.read(0, [0, 0], black_box([SIDE, SIDE]))));
 
     let forest = Forest::new(10, 6, [1, 1]).expect("within the documented limits");
-    let samples = Samples { origin: [0, 0], cells: [SIDE, SIDE], heights: &heights };
-    let node = |x: u32, y: u32| heights[(y * (SIDE + 1) + x) as usize];
-    for level in [4, 5] {
+    group.bench_function("samples", |b| b.iter(|| Samples::new([0, 0], [SIDE, SIDE], black_box(&heights))));
+    let samples = Samples::new([0, 0], [SIDE, SIDE], &heights);
+    for level in 1..forest.levels() {
+        let spacing_log2 = forest.root_log2() - forest.patch_log2() - level.div_ceil(2);
+        let window = canvas.read(spacing_log2, [0, 0], [SIDE, SIDE]).expect("what was written");
+        let nodes = Nodes { spacing_log2, origin: [0, 0], width: window.width(), heights: window.heights() };
         group.bench_function(format!("measure_level_{level}"), |b| {
             b.iter(|| {
                 let mut found = HashMap::new();
-                measure(&forest, level, samples, node, &mut found);
+                measure(&forest, level, &samples, nodes, &mut found);
                 found
             });
         });
     }
     group.finish();
+    whole(&mut criterion, folder.path());
     criterion.final_summary();
 }

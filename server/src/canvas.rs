@@ -44,33 +44,75 @@ impl Window {
         self.heights[j as usize * self.width as usize + i as usize]
     }
 
-    /// Rows of the window, from the south.
-    pub fn rows(&self) -> impl Iterator<Item = &[i32]> {
-        self.heights.chunks_exact(self.width as usize)
+    /// The heights, row by row from the south.
+    #[must_use]
+    pub fn heights(&self) -> &[i32] {
+        &self.heights
     }
 
-    /// Whether no sample of the window has a height.
+    /// Base-2 logarithm of the spacing of the samples.
     #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.heights.iter().all(|h| *h == NODATA)
+    pub fn spacing_log2(&self) -> u32 {
+        self.spacing_log2
+    }
+
+    /// Lattice coordinates of the first sample.
+    #[must_use]
+    pub fn origin(&self) -> [u32; 2] {
+        [self.x0 << self.spacing_log2, self.y0 << self.spacing_log2]
+    }
+
+    /// Samples in a row.
+    #[must_use]
+    pub fn width(&self) -> usize {
+        self.width as usize
     }
 }
 
 impl Canvas {
-    /// Empty planes for `width` by `height` samples, spacings 1 to 2^`coarsest`, in files that are gone
-    /// with the folder.
+    /// Planes for `width` by `height` samples, spacings 1 to 2^`coarsest`, in files that go with the
+    /// folder; those that are there already are emptied. Space is taken as rows are written.
     ///
     /// # Errors
     /// When the folder cannot be written.
     pub fn create(folder: &Path, width: u32, height: u32, coarsest: u32) -> io::Result<Self> {
         let mut planes = Vec::new();
         for j in 0..=coarsest {
-            let path = folder.join(format!("plane-{j}"));
-            let file = File::options().create_new(true).read(true).write(true).open(path)?;
-            let samples = |n: u32| ((n - 1) >> j) + 1;
-            planes.push(Plane { file, width: samples(width), height: samples(height) });
+            let [width, height] = [width, height].map(|n| ((n - 1) >> j) + 1);
+            let path = plane_path(folder, j);
+            let file = File::options().create(true).truncate(true).read(true).write(true).open(path)?;
+            file.set_len(plane_bytes(width, height))?;
+            planes.push(Plane { file, width, height });
         }
         Ok(Self { planes, folder: folder.to_owned() })
+    }
+
+    /// The planes that an earlier run left; `None` if some are missing or not as long as they should be.
+    ///
+    /// # Errors
+    /// When they cannot be opened.
+    pub fn reopen(folder: &Path, width: u32, height: u32, coarsest: u32) -> io::Result<Option<Self>> {
+        let mut planes = Vec::new();
+        for j in 0..=coarsest {
+            let [width, height] = [width, height].map(|n| ((n - 1) >> j) + 1);
+            let file = match File::options().read(true).write(true).open(plane_path(folder, j)) {
+                Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
+                file => file?,
+            };
+            if file.metadata()?.len() != plane_bytes(width, height) {
+                return Ok(None);
+            }
+            planes.push(Plane { file, width, height });
+        }
+        Ok(Some(Self { planes, folder: folder.to_owned() }))
+    }
+
+    /// Makes sure that the rows written so far are on the disk.
+    ///
+    /// # Errors
+    /// When the disk is full or fails.
+    pub fn sync(&self) -> io::Result<()> {
+        self.planes.iter().try_for_each(|plane| plane.file.sync_data())
     }
 
     /// Where the planes lie.
@@ -128,6 +170,14 @@ impl Canvas {
         }
         Ok(Window { spacing_log2, x0: i0, y0: j0, width, heights })
     }
+}
+
+fn plane_path(folder: &Path, spacing_log2: u32) -> PathBuf {
+    folder.join(format!("plane-{spacing_log2}"))
+}
+
+fn plane_bytes(width: u32, height: u32) -> u64 {
+    u64::from(width) * u64::from(height) * 4
 }
 
 #[cfg(test)]

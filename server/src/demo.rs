@@ -81,6 +81,8 @@ pub fn run(folder: &Path, samples: u32, listen: SocketAddr, headless: bool) -> R
         quantum: None,
         patch_log2: 6,
         memory: 1 << 30,
+        fresh: false,
+        checkpoint: hierarchy::CHECKPOINT,
     };
     let report = hierarchy::build(&source, &store, &options, &Progress::new())?;
     say(&format!(

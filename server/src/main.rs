@@ -3,17 +3,19 @@
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use diamantina_protocol::message::{Kind, is_name};
 use diamantina_protocol::points::Rule;
-use diamantina_server::hierarchy::{self, BuildError, Report};
+use diamantina_server::hierarchy::{self, BuildError, Estimate, Report};
 use diamantina_server::ingest::IngestError;
 use diamantina_server::inspect::{self, Inspection};
 use diamantina_server::progress::Progress;
-use diamantina_server::store::Store;
+use diamantina_server::store::{Store, StoreError};
 use diamantina_server::{curve, demo, http, ingest};
 use std::io::Write;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
+use std::time::Duration;
+use tokio::signal::unix::{SignalKind, signal};
 
 /// Builds and serves streamed terrain.
 #[derive(Parser)]
@@ -39,7 +41,8 @@ enum Command {
 
 #[derive(Args)]
 struct BuildArgs {
-    /// DEM files of one layer: GeoTIFF, .hgt, Arc ASCII, USGS DEM, PNG, raw; .gz and .zip of these
+    /// DEM files of one layer: GeoTIFF, .hgt, Arc ASCII, USGS DEM or PNG, also in a .gz, or alone in a .zip; raw,
+    /// also in a .gz
     #[arg(required = true, value_name = "DEM")]
     sources: Vec<PathBuf>,
     /// The folder of the store; an older scene in it is replaced once the new one is complete
@@ -52,8 +55,8 @@ struct BuildArgs {
     #[arg(long, default_value = "2GiB", value_name = "BYTES", value_parser = parse_bytes)]
     memory: u64,
     /// Threads [default: one a core]
-    #[arg(long, value_name = "N")]
-    threads: Option<usize>,
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
     /// Encodings to build
     #[arg(long, default_value = "points", value_enum, value_delimiter = ',')]
     encoding: Vec<Encoding>,
@@ -71,6 +74,15 @@ struct BuildArgs {
     scene: Option<String>,
     #[command(flatten)]
     ingest: ingest::Options,
+    /// Begin anew even where an interrupted build of the same could be gone on with
+    #[arg(long)]
+    fresh: bool,
+    /// Seconds between checkpoints: the most work that a kill costs
+    #[arg(long, default_value_t = hierarchy::CHECKPOINT.as_secs(), value_name = "SECONDS")]
+    checkpoint: u64,
+    /// Only estimate, from a sample of the source, what the build would take and give; nothing is written
+    #[arg(long)]
+    dry_run: bool,
     /// Print the report as JSON
     #[arg(long)]
     json: bool,
@@ -155,12 +167,26 @@ fn parse_bytes(text: &str) -> Result<u64, String> {
     value.checked_mul(scale).ok_or_else(|| "more than 16 EiB".to_owned())
 }
 
-/// A failure with its exit code: 1 failed, 2 wrong use.
+/// The exit code of a build that was asked to stop.
+const INTERRUPTED: u8 = 130;
+
+/// How long a build may take to stop.
+const STOP_MAX: Duration = Duration::from_millis(9500);
+
+/// A failure with its exit code: 1 failed, 2 wrong use, 130 interrupted.
 struct Failure(u8, String);
 
 impl<E: std::error::Error> From<E> for Failure {
     fn from(error: E) -> Self {
         Self(1, error.to_string())
+    }
+}
+
+/// What became of printing results. That nobody reads any more, as behind `| head`, is no failure.
+fn shown(printed: std::io::Result<()>) -> std::io::Result<()> {
+    match printed {
+        Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        other => other,
     }
 }
 
@@ -202,15 +228,26 @@ fn scene_name(given: Option<String>, store: &Path) -> Result<String, Failure> {
     let fit: String = folder
         .chars()
         .map(|c| if c.is_ascii_alphanumeric() || "._-".contains(c) { c } else { '-' })
-        .take(64)
         .collect();
     let fit = fit.trim_start_matches('.').to_owned();
-    Ok(if fit.is_empty() { "scene".to_owned() } else { fit })
+    match fit.as_str() {
+        "" => Ok("scene".to_owned()),
+        name if is_name(name) => Ok(fit),
+        name => Err(Failure(
+            2,
+            format!(
+                "{}: expected a folder whose name can be the scene's, at most 64 characters, found {}: \
+                 name the scene with --scene NAME",
+                store.display(),
+                name.len()
+            ),
+        )),
+    }
 }
 
 fn build(args: BuildArgs) -> Result<(), Failure> {
     if let Some(threads) = args.threads {
-        rayon::ThreadPoolBuilder::new().num_threads(threads).build_global()?;
+        rayon::ThreadPoolBuilder::new().num_threads(threads.into()).build_global()?;
     }
     let options = hierarchy::Options {
         scene: scene_name(args.scene, &args.output)?,
@@ -228,16 +265,53 @@ fn build(args: BuildArgs) -> Result<(), Failure> {
             _ => 6,
         },
         memory: args.memory,
+        fresh: args.fresh,
+        checkpoint: Duration::from_secs(args.checkpoint),
     };
     let source = ingest::open(&args.sources, &args.ingest).map_err(|e| refuse_build(&[], &e.into()))?;
-    let report = hierarchy::build(&source, &args.output, &options, &Progress::new())
+    if args.dry_run {
+        let estimate = hierarchy::estimate(&source, &options).map_err(|e| refuse_build(&args.sources, &e))?;
+        let mut out = std::io::stdout().lock();
+        if args.json {
+            writeln!(out, "{}", serde_json::to_string_pretty(&estimate)?)?;
+        } else {
+            print_estimate(&mut out, &args.output, &estimate)?;
+        }
+        return Ok(());
+    }
+    let progress = Arc::new(Progress::new());
+    stop_on_signals(&progress)?;
+    let report = hierarchy::build(&source, &args.output, &options, &progress)
         .map_err(|e| refuse_build(&args.sources, &e))?;
     let mut out = std::io::stdout().lock();
     if args.json {
-        writeln!(out, "{}", serde_json::to_string_pretty(&report)?)?;
+        shown(writeln!(out, "{}", serde_json::to_string_pretty(&report)?))?;
     } else {
-        print_report(&mut out, &args.output, &report)?;
+        shown(print_report(&mut out, &args.output, &report))?;
     }
+    Ok(())
+}
+
+/// The first Ctrl-C or SIGTERM asks for a stop, which keeps what is done; a second one ends the program at once,
+/// and so do ten seconds.
+fn stop_on_signals(progress: &Arc<Progress>) -> std::io::Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let guard = runtime.enter();
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let mut terminate = signal(SignalKind::terminate())?;
+    drop(guard);
+    let progress = Arc::clone(progress);
+    std::thread::spawn(move || {
+        runtime.block_on(async {
+            tokio::select! { _ = interrupt.recv() => {}, _ = terminate.recv() => {} }
+            progress.stop();
+            progress.say("stopping; once more ends at once");
+            // Whatever holds the build up, its last checkpoint is on the disk.
+            let patience = tokio::time::sleep(STOP_MAX);
+            tokio::select! { _ = interrupt.recv() => {}, _ = terminate.recv() => {}, () = patience => {} }
+        });
+        std::process::exit(i32::from(INTERRUPTED));
+    });
     Ok(())
 }
 
@@ -248,6 +322,7 @@ fn refuse_build(sources: &[PathBuf], error: &BuildError) -> Failure {
         BuildError::MaxError { .. }
             | BuildError::Quantum(_)
             | BuildError::Memory { .. }
+            | BuildError::Store(StoreError::Foreign { .. })
             | BuildError::Ingest(IngestError::Options { .. })
     );
     // What the heights themselves are to blame for names where they came from.
@@ -255,7 +330,37 @@ fn refuse_build(sources: &[PathBuf], error: &BuildError) -> Failure {
     let names: Vec<String> =
         sources.iter().filter(|_| about_heights).map(|s| s.display().to_string()).collect();
     let from = if names.is_empty() { String::new() } else { format!("{}: ", names.join(", ")) };
-    Failure(if wrong_use { 2 } else { 1 }, format!("{from}{error}"))
+    let code = match error {
+        BuildError::Interrupted { .. } => INTERRUPTED,
+        _ if wrong_use => 2,
+        _ => 1,
+    };
+    Failure(code, format!("{from}{error}"))
+}
+
+fn print_estimate(out: &mut impl Write, store: &Path, e: &Estimate) -> std::io::Result<()> {
+    writeln!(
+        out,
+        "{}: estimated from {} of {} samples; nothing was written",
+        store.display(),
+        e.sampled,
+        e.samples
+    )?;
+    writeln!(out, "  {:.1} % nodata", 100.0 * (1.0 - e.valid_samples as f64 / e.samples as f64))?;
+    writeln!(
+        out,
+        "  about {} diamonds, {} bytes of points ({:.2} bits a sample)",
+        e.diamonds, e.point_bytes, e.bits_per_sample
+    )?;
+    let mebibytes = |bytes: u64| bytes as f64 / f64::from(1 << 20);
+    writeln!(
+        out,
+        "  about {:.1} s with {} threads, at most {:.0} MiB of memory, {:.0} MiB of disk while at work",
+        e.seconds,
+        rayon::current_num_threads(),
+        mebibytes(e.memory_bytes),
+        mebibytes(e.disk_bytes)
+    )
 }
 
 fn print_report(out: &mut impl Write, store: &Path, report: &Report) -> std::io::Result<()> {
@@ -284,8 +389,8 @@ fn print_report(out: &mut impl Write, store: &Path, report: &Report) -> std::io:
 fn serve(stores: &[PathBuf], listen: SocketAddr) -> Result<(), Failure> {
     let server = http::Server::open(stores, listen)?;
     let mut out = std::io::stdout().lock();
-    writeln!(out, "Serving {} at {}", server.scenes().join(", "), server.address())?;
-    out.flush()?;
+    let printed = writeln!(out, "Serving {} at {}", server.scenes().join(", "), server.address());
+    shown(printed.and_then(|()| out.flush()))?;
     drop(out);
     Ok(server.run_until_signal()?)
 }
@@ -303,9 +408,9 @@ fn inspect_store(args: &InspectArgs) -> Result<(), Failure> {
         curve::write(&store, &mut file)?.map_err(unwritten)?;
     }
     if args.json {
-        writeln!(out, "{}", serde_json::to_string_pretty(&inspection)?)?;
+        shown(writeln!(out, "{}", serde_json::to_string_pretty(&inspection)?))?;
     } else {
-        print_inspection(&mut out, &inspection)?;
+        shown(print_inspection(&mut out, &inspection))?;
     }
     Ok(())
 }

@@ -1,5 +1,7 @@
 //! The fetcher against a server that fails in every way.
 
+#![allow(clippy::cast_possible_truncation, reason = "small numbers")]
+
 use super::*;
 use crate::world::{Faults, Served, world};
 use diamantina_protocol::message;

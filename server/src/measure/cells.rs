@@ -1,124 +1,69 @@
-//! How far the surface drawn at a level lies from the source: every sample, exactly.
-//!
-//! The surface of a level is made of micro-triangles between lattice points. On the lattice of an even
-//! level they are the halves of square cells; on that of an odd level, the quarters, cut by both
-//! diagonals. Over each the surface is a plane, and since cells are powers of two wide all arithmetic in
-//! `f64` is exact. Samples on a shared edge count for both sides, as both draw them.
-//!
-//! **Nodata.** A triangle with a corner that has no height is not drawn. Where a level draws what the
-//! source has not, or leaves out what it has, the two outlines differ; each such sample lies in a
-//! triangle that has both data and nodata, so the outlines are at most a hypotenuse apart, and that
-//! length is added to the error of the diamond.
+//! The samples of a tile against the surface, cell by cell, row by row: the way that knows of nodata.
 
+use super::{Found, Nodes, Samples, Square};
 use diamantina_protocol::NODATA;
-use diamantina_protocol::bintree::Forest;
-use diamantina_protocol::diamond::Diamond;
-use std::collections::HashMap;
 
-/// What was found of a diamond.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Found {
-    /// The largest vertical distance, in quanta.
-    pub vertical: f64,
-    /// Whether the outlines differ.
-    pub outline: bool,
-}
-
-impl Found {
-    /// The worse of both.
-    pub fn merge(&mut self, other: Self) {
-        self.vertical = self.vertical.max(other.vertical);
-        self.outline |= other.outline;
-    }
-}
-
-/// The samples of a rectangle of the lattice, one cell apart.
-#[derive(Debug, Clone, Copy)]
-pub struct Samples<'a> {
-    /// Lattice coordinates of the south-west sample.
-    pub origin: [u32; 2],
-    /// Cells along x and y; there is one sample more.
-    pub cells: [u32; 2],
-    /// Heights in quanta, row by row from the south.
-    pub heights: &'a [i32],
-}
-
-/// Compares the surface of `level` (1 to `forest.levels()` - 1) with the samples, and adds what it finds to
-/// `found`. `node(x, y)` is the height that the level draws at a point of its lattice.
-///
-/// The rectangle must be a square of the quadtree of roots, so that it is made of whole cells or lies
-/// within one.
-pub fn measure(
-    forest: &Forest,
+/// Compares the samples of `tile`, which lies in the macro-square `around`, with the surface of `level`.
+/// `local` is what is found of the macro-square's triangles: of an even level the first is both; of an odd
+/// one they are those at its south, east, north and west side.
+pub(super) fn measure(
     level: u32,
-    samples: Samples<'_>,
-    node: impl Fn(u32, u32) -> i32,
-    found: &mut HashMap<Diamond, Found>,
+    tile: Square,
+    around: Square,
+    samples: &Samples<'_>,
+    nodes: Nodes<'_>,
+    local: &mut [Found; 4],
 ) {
-    let spacing = 1u32 << (forest.root_log2() - forest.patch_log2() - level / 2);
-    let macro_log2 = forest.root_log2() - level / 2;
-    let [x0, y0] = samples.origin;
-    let [x1, y1] = [x0 + samples.cells[0], y0 + samples.cells[1]];
-    let first = |w: u32| w & !(spacing - 1);
-    // A macro-square's triangles, one or four, collect before they are put into the map.
-    let macro_side = 1u32 << macro_log2;
-    let mut square_y = y0 & !(macro_side - 1);
-    while square_y < y1 {
-        let mut square_x = x0 & !(macro_side - 1);
-        while square_x < x1 {
-            let mut local = [Found::default(); 4];
-            for cell_y in (first(y0.max(square_y))..y1.min(square_y + macro_side)).step_by(spacing as usize) {
-                for cell_x in
-                    (first(x0.max(square_x))..x1.min(square_x + macro_side)).step_by(spacing as usize)
-                {
-                    let cell = Square { x: cell_x, y: cell_y, side: spacing };
-                    if level.is_multiple_of(2) {
-                        halves(cell, samples, &node, &mut local[0]);
-                    } else {
-                        let macro_square = Square { x: square_x, y: square_y, side: macro_side };
-                        quarters(cell, macro_square, samples, &node, &mut local);
-                    }
-                }
-            }
-            let half = macro_side / 2;
-            let centres = if level.is_multiple_of(2) {
-                [Some([square_x + half, square_y + half]), None, None, None]
+    let even = level.is_multiple_of(2);
+    let side = 1u32 << (nodes.spacing_log2 + u32::from(!even));
+    let first = |w: u32| w & !(side - 1);
+    let window = Window { samples, tile };
+    for y in (first(tile.y)..tile.y + tile.side).step_by(side as usize) {
+        for x in (first(tile.x)..tile.x + tile.side).step_by(side as usize) {
+            let cell = Square { x, y, side };
+            if even {
+                halves(cell, window, nodes, &mut local[0]);
             } else {
-                [
-                    Some([square_x + half, square_y]),
-                    Some([square_x + macro_side, square_y + half]),
-                    Some([square_x + half, square_y + macro_side]),
-                    Some([square_x, square_y + half]),
-                ]
-            };
-            for (centre, here) in centres.into_iter().zip(local) {
-                if let Some(d) = centre.and_then(|c| forest.diamond(c)).filter(|_| here != Found::default()) {
-                    found.entry(d).or_default().merge(here);
-                }
+                quarters(cell, around, window, nodes, local);
             }
-            square_x += macro_side;
         }
-        square_y += macro_side;
     }
 }
 
+/// The samples of a tile.
 #[derive(Clone, Copy)]
-struct Square {
-    x: u32,
-    y: u32,
-    side: u32,
+struct Window<'a> {
+    samples: &'a Samples<'a>,
+    tile: Square,
+}
+
+impl Window<'_> {
+    /// The part of a cell's 0..=side along x that the tile covers.
+    fn across(self, corner: u32, side: u32) -> [u32; 2] {
+        clip(self.tile.x, self.tile.side, corner, side)
+    }
+
+    /// The same along y.
+    fn along(self, corner: u32, side: u32) -> [u32; 2] {
+        clip(self.tile.y, self.tile.side, corner, side)
+    }
+}
+
+fn clip(low: u32, length: u32, corner: u32, side: u32) -> [u32; 2] {
+    [low.saturating_sub(corner), (low + length - corner).min(side)]
 }
 
 /// The two triangles of a cell of an even level. Diagonals join points whose coordinates, in cells, sum
 /// to an even number.
-fn halves(cell: Square, samples: Samples<'_>, node: &impl Fn(u32, u32) -> i32, found: &mut Found) {
+fn halves(cell: Square, window: Window<'_>, nodes: Nodes<'_>, found: &mut Found) {
     let Square { x, y, side } = cell;
-    let corners = [node(x, y), node(x + side, y), node(x + side, y + side), node(x, y + side)];
+    let corners =
+        [nodes.at(x, y), nodes.at(x + side, y), nodes.at(x + side, y + side), nodes.at(x, y + side)];
     let [sw, se, ne, nw] = corners;
     let s = f64::from(side);
     let value = |h: i32| (h != NODATA).then_some(f64::from(h));
     let rising = (x / side + y / side).is_multiple_of(2);
-    let row_clip = samples.clip(1, y, side);
+    let row_clip = window.along(y, side);
     for dy in row_clip[0]..=row_clip[1] {
         let t = f64::from(dy) / s;
         // Along a row the diagonal is met at dx = dy, or at side - dy.
@@ -141,24 +86,19 @@ fn halves(cell: Square, samples: Samples<'_>, node: &impl Fn(u32, u32) -> i32, f
         let diagonal = if rising { edges(sw, ne) } else { edges(se, nw) };
         let (bottom, top) = (edges(sw, se), edges(nw, ne));
         let flat = |dy: u32| (dy == 0 && bottom) || (dy == side && top);
-        run(samples, cell, dy, [0, cut], left, [edges(sw, nw), diagonal], flat(dy), found);
-        run(samples, cell, dy, [cut, side], right, [diagonal, edges(se, ne)], flat(dy), found);
+        run(window, cell, dy, [0, cut], left, [edges(sw, nw), diagonal], flat(dy), found);
+        run(window, cell, dy, [cut, side], right, [diagonal, edges(se, ne)], flat(dy), found);
     }
 }
 
 /// The four triangles of a cell of an odd level, each with the middle as its apex; `local` by side of
 /// the macro-square: south, east, north, west.
-fn quarters(
-    cell: Square,
-    around: Square,
-    samples: Samples<'_>,
-    node: &impl Fn(u32, u32) -> i32,
-    local: &mut [Found; 4],
-) {
+fn quarters(cell: Square, around: Square, window: Window<'_>, nodes: Nodes<'_>, local: &mut [Found; 4]) {
     let Square { x, y, side } = cell;
     let half = side / 2;
-    let corners = [node(x, y), node(x + side, y), node(x + side, y + side), node(x, y + side)];
-    let middle = node(x + half, y + half);
+    let corners =
+        [nodes.at(x, y), nodes.at(x + side, y), nodes.at(x + side, y + side), nodes.at(x, y + side)];
+    let middle = nodes.at(x + half, y + half);
     let s = f64::from(side);
     let value = |h: i32| (h != NODATA).then_some(f64::from(h));
     // Which triangle of the macro-square each quarter lies in: by its centroid, in sixths of a cell.
@@ -176,7 +116,7 @@ fn quarters(
     let [sw, se, ne, nw] = corners.map(value);
     let m = value(middle);
     let edges = |a: Option<f64>, b: Option<f64>| a.is_some() && b.is_some();
-    let row_clip = samples.clip(1, y, side);
+    let row_clip = window.along(y, side);
     for dy in row_clip[0]..=row_clip[1] {
         let t = f64::from(dy) / s;
         // West, then south or north, then east.
@@ -194,9 +134,9 @@ fn quarters(
         let lower = dy <= half;
         let (d_west, d_east) =
             if lower { (edges(sw, m), edges(se, m)) } else { (edges(nw, m), edges(ne, m)) };
-        run(samples, cell, dy, [0, near], west, [edges(sw, nw), d_west], false, &mut local[of_quarter[3]]);
+        run(window, cell, dy, [0, near], west, [edges(sw, nw), d_west], false, &mut local[of_quarter[3]]);
         run(
-            samples,
+            window,
             cell,
             dy,
             [side - near, side],
@@ -208,7 +148,7 @@ fn quarters(
         if lower {
             let flat = dy == 0 && edges(sw, se);
             run(
-                samples,
+                window,
                 cell,
                 dy,
                 [near, side - near],
@@ -221,7 +161,7 @@ fn quarters(
         if dy >= half {
             let flat = dy == side && edges(nw, ne);
             run(
-                samples,
+                window,
                 cell,
                 dy,
                 [near, side - near],
@@ -254,7 +194,7 @@ fn plane(
     reason = "the inner loop of the measurement; a struct would be built a million times"
 )]
 fn run(
-    samples: Samples<'_>,
+    window: Window<'_>,
     cell: Square,
     dy: u32,
     dx: [u32; 2],
@@ -263,11 +203,12 @@ fn run(
     flat: bool,
     found: &mut Found,
 ) {
-    let clip = samples.clip(0, cell.x, cell.side);
+    let clip = window.across(cell.x, cell.side);
     let (from, to) = (dx[0].max(clip[0]), dx[1].min(clip[1]));
     if from > to {
         return;
     }
+    let samples = window.samples;
     let row = (cell.y + dy - samples.origin[1]) as usize * (samples.cells[0] + 1) as usize;
     // Counted from the window's first sample, which may lie right of the cell's corner.
     let at = |dx: u32| row + (cell.x + dx - samples.origin[0]) as usize;
@@ -290,13 +231,5 @@ fn run(
             let corner = (dy == 0 || dy == cell.side) && (dx_here == 0 || dx_here == cell.side);
             *h != NODATA && !on_edge(dx_here) && !corner
         });
-    }
-}
-
-impl Samples<'_> {
-    /// The part of a cell's 0..=side along an axis that the samples cover.
-    fn clip(&self, axis: usize, corner: u32, side: u32) -> [u32; 2] {
-        let (low, high) = (self.origin[axis], self.origin[axis] + self.cells[axis]);
-        [low.saturating_sub(corner), (high - corner).min(side)]
     }
 }

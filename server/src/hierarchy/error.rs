@@ -1,0 +1,113 @@
+//! Why a scene could not be built: the file, what was expected, what was found and what to do.
+
+use super::transcribe::HEIGHT_METRES_MAX;
+use crate::ingest::IngestError;
+use crate::store::StoreError;
+use diamantina_protocol::bintree::ForestError;
+use diamantina_protocol::points::{CodingError, SOURCE_MAX};
+use std::io;
+use std::path::PathBuf;
+
+/// Why a scene could not be built.
+#[derive(Debug, thiserror::Error)]
+pub enum BuildError {
+    /// The source could not be read.
+    #[error(transparent)]
+    Ingest(#[from] IngestError),
+    /// The store could not be written.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The working files could not be written.
+    #[error("{path}: cannot write the working files: {error}; {}", work_remedy(error))]
+    Work {
+        /// The work folder.
+        path: PathBuf,
+        /// What the system said.
+        error: io::Error,
+    },
+    /// Somebody asked for a stop.
+    #[error(
+        "interrupted: {done} of {chunks} chunks are done; the same command goes on from there (--fresh starts anew)"
+    )]
+    Interrupted {
+        /// Chunks done.
+        done: u64,
+        /// All chunks.
+        chunks: u64,
+    },
+    /// No sample has a height.
+    #[error(
+        "the source has no data: all {0} samples are nodata; check its nodata value, or give another with --nodata"
+    )]
+    AllNodata(u64),
+    /// Heights do not fit in the integers of the format.
+    #[error("height {value} is {} quanta of {quantum} m, beyond {SOURCE_MAX}: if it stands for nodata, say --nodata; else give a larger --quantum", (value / quantum).round())]
+    Range {
+        /// Metres.
+        value: f64,
+        /// Metres of a quantum.
+        quantum: f64,
+    },
+    /// The quantum makes no sense.
+    #[error("--quantum {0}: expected metres above 0 and below {HEIGHT_METRES_MAX}")]
+    Quantum(f64),
+    /// The asked error is out of range.
+    #[error("--max-error {asked}: expected 0 to {limit} m for a quantum of {quantum} m")]
+    MaxError {
+        /// Metres asked.
+        asked: f64,
+        /// The largest that can be coded.
+        limit: f64,
+        /// Metres of a quantum.
+        quantum: f64,
+    },
+    /// Too large, or too thin, for a forest.
+    #[error(
+        "the source has {width} x {height} samples: {error}; cut it into pieces and build a store of each"
+    )]
+    Forest {
+        /// Samples along x.
+        width: u32,
+        /// Samples along y.
+        height: u32,
+        /// Why not.
+        error: ForestError,
+    },
+    /// Our own steps were refused.
+    #[error("steps: {0}")]
+    Coding(#[from] CodingError),
+    /// The memory asked for is too little.
+    #[error("--memory {}: too little for this source: say --memory {} or more", mebibytes(*asked), mebibytes(*needed))]
+    Memory {
+        /// Bytes asked.
+        asked: u64,
+        /// Bytes needed.
+        needed: u64,
+    },
+}
+
+/// Bytes as the command line takes them, rounded up.
+fn mebibytes(bytes: u64) -> String {
+    format!("{}MiB", bytes.div_ceil(1 << 20))
+}
+
+fn work_remedy(error: &io::Error) -> &'static str {
+    match error.kind() {
+        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
+            "free some space (16/3 bytes a sample) and build again: the same command goes on where this one \
+             ended (the old scene, if any, is untouched)"
+        }
+        _ => "check the disk, or choose another folder with -o",
+    }
+}
+
+impl BuildError {
+    /// Whether the work folder is of use to another run: the source and the options are not to blame.
+    pub(super) fn keeps_work(&self) -> bool {
+        match self {
+            Self::Work { .. } | Self::Interrupted { .. } => true,
+            Self::Store(error) => !matches!(error, StoreError::Spool { .. }),
+            _ => false,
+        }
+    }
+}

@@ -1,0 +1,253 @@
+//! What a build would take and give, from a bounded sample of the source: a dry run.
+//!
+//! The source is cut into tiles of 256 x 256 cells. Some are read, to know how much of it has heights; some
+//! of those are built as if each were a source of its own, by the same code, in a temporary folder. What a
+//! tile's root costs stands for the coarser levels that it has not: both code one point in sixteen (n = 64).
+
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "estimates are rounded, and sides of tiles are below 2^9"
+)]
+
+use super::coding::{coding, fine_step};
+use super::journal::Journal;
+use super::plan::Plan;
+use super::tallies::Tallies;
+use super::transcribe::{find_quantum, to_quanta};
+use super::work::{Work, failure};
+use super::{Build, BuildError, Options, Stats, forest_of};
+use crate::canvas::Canvas;
+use crate::ingest::{Grid, Source};
+use crate::progress::Progress;
+use crate::store::Writer;
+use diamantina_protocol::NODATA;
+use diamantina_protocol::bintree::Forest;
+use diamantina_protocol::points;
+use rayon::prelude::*;
+use std::collections::HashSet;
+use std::sync::Mutex;
+use std::sync::atomic::AtomicU64;
+use std::time::{Duration, Instant};
+
+/// Cells along a side of a tile.
+const TILE: u32 = 256;
+/// Tiles that are read: 17 million samples.
+const READ_MAX: usize = 256;
+/// Tiles that are built: 4 million samples.
+const BUILT_MAX: usize = 64;
+/// What a whole build takes for each sample, compared with a tile's: diamonds that straddle chunks are coded
+/// on both sides, there are more levels to compare, and blobs are laid into packs. Measured.
+const WHOLE_TO_TILE: f64 = 1.25;
+/// What a payload takes whatever it holds: its header and the end of its symbols.
+const FIXED_BYTES: f64 = points::HEADER_BYTES as f64 + 4.0;
+/// What the journal takes for a diamond.
+const JOURNAL_BYTES: u64 = 60;
+
+/// What a build is expected to take and to give.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
+pub struct Estimate {
+    /// Samples of the source.
+    pub samples: u64,
+    /// Samples that have a height.
+    pub valid_samples: u64,
+    /// Samples that the estimate rests on.
+    pub sampled: u64,
+    /// Diamonds with a payload.
+    pub diamonds: u64,
+    /// Bytes of payloads.
+    pub point_bytes: u64,
+    /// Bits of payload for each sample that has a height.
+    pub bits_per_sample: f64,
+    /// Seconds, with the threads at hand.
+    pub seconds: f64,
+    /// The most memory that it takes.
+    pub memory_bytes: u64,
+    /// Space that the work folder needs, the new store included.
+    pub disk_bytes: u64,
+}
+
+/// A tile that was read.
+struct Tile {
+    size: [u32; 2],
+    heights: Vec<i32>,
+    stats: Stats,
+    /// Whether each quarter has a height.
+    quarters: [bool; 4],
+}
+
+/// Estimates what [`super::build`] would take and give. Reads at most 17 million samples and takes at most
+/// 100 MB of memory and of temporary files.
+///
+/// # Errors
+/// When the source cannot be read or the options do not fit it, as in a build.
+pub fn estimate(source: &Source, options: &Options) -> Result<Estimate, BuildError> {
+    let grid = source.grid();
+    let forest = forest_of(grid, options)?;
+    let plan = Plan::new(forest, options.memory)?;
+    let quantum = find_quantum(source, options)?;
+    let started = Instant::now();
+    let chosen = spread(tiles(grid), READ_MAX);
+    let mut tiles: Vec<Tile> =
+        chosen.par_iter().map(|corner| read_tile(source, *corner, quantum)).collect::<Result<_, _>>()?;
+    let reading = started.elapsed();
+    let samples = u64::from(grid.width) * u64::from(grid.height);
+    let sum = |tiles: &[Tile]| {
+        tiles.iter().fold((0, 0), |(all, valid), t| (all + t.heights.len() as u64, valid + t.stats.valid))
+    };
+    let (read, valid) = sum(&tiles);
+    let valid_samples = (samples as f64 * valid as f64 / read as f64).round() as u64;
+    let diamonds = diamonds(&forest, grid, &tiles);
+
+    tiles.retain(|tile| tile.stats.valid > 0);
+    let tiles = spread(tiles, BUILT_MAX);
+    let (built, built_valid) = sum(&tiles);
+    let each: Vec<(f64, Duration)> =
+        tiles.par_iter().map(|tile| build_tile(tile, grid, options)).collect::<Result<_, BuildError>>()?;
+    let bytes: f64 = each.iter().map(|(bytes, _)| bytes).sum();
+    let workers = rayon::current_num_threads().min(plan.workers);
+    let building = each.iter().map(|(_, took)| *took).sum::<Duration>() / workers as u32;
+    let per = |part: f64, of: u64| if of == 0 { 0.0 } else { part / of as f64 };
+    let point_bytes = (per(bytes, built_valid) * valid_samples as f64).round() as u64;
+    let seconds = samples as f64 * per(reading.as_secs_f64(), read)
+        + valid_samples as f64 * per(building.as_secs_f64(), built_valid) * WHOLE_TO_TILE;
+    Ok(Estimate {
+        samples,
+        valid_samples,
+        sampled: read.max(built),
+        diamonds,
+        point_bytes,
+        bits_per_sample: per(point_bytes as f64 * 8.0, valid_samples),
+        seconds,
+        memory_bytes: plan.memory,
+        // A third more for the coarser planes; payloads in the spool and in the packs.
+        disk_bytes: samples * 16 / 3 + 2 * point_bytes + diamonds * JOURNAL_BYTES,
+    })
+}
+
+/// South-west samples of all tiles, in Morton order: neighbours in the list are neighbours on the ground.
+fn tiles(grid: &Grid) -> Vec<[u32; 2]> {
+    let count = |samples: u32| samples.saturating_sub(1).max(1).div_ceil(TILE);
+    let (columns, rows) = (count(grid.width), count(grid.height));
+    let mut all: Vec<[u32; 2]> = (0..rows).flat_map(|j| (0..columns).map(move |i| [i, j])).collect();
+    let interleaved = |[i, j]: [u32; 2]| {
+        (0..32).map(|bit| (u64::from(i >> bit & 1) | u64::from(j >> bit & 1) << 1) << (2 * bit)).sum::<u64>()
+    };
+    all.sort_unstable_by_key(|tile| interleaved(*tile));
+    all.into_iter().map(|tile| tile.map(|w| w * TILE)).collect()
+}
+
+/// At most `count` of a list, at even distances.
+fn spread<T>(list: Vec<T>, count: usize) -> Vec<T> {
+    let all = list.len();
+    if all <= count {
+        return list;
+    }
+    let mut next = 0;
+    let kept = list.into_iter().enumerate().filter(|(at, _)| {
+        // The middle of each of `count` equal stretches.
+        let take = *at == (2 * next + 1) * all / (2 * count);
+        next += usize::from(take);
+        take
+    });
+    kept.map(|(_, item)| item).collect()
+}
+
+fn read_tile(source: &Source, [x, y]: [u32; 2], quantum: f64) -> Result<Tile, BuildError> {
+    let grid = source.grid();
+    let size = [(grid.width - x).min(TILE + 1), (grid.height - y).min(TILE + 1)];
+    let mut values = Vec::new();
+    source.read(x, y, size[0], size[1], &mut values)?;
+    let (heights, stats) = to_quanta(&values, grid, quantum)?;
+    let mut quarters = [false; 4];
+    for (row, j) in heights.chunks_exact(size[0] as usize).zip(0u32..) {
+        let (west, east) = row.split_at(row.len().min(TILE as usize / 2));
+        let south = if j < TILE / 2 { 0 } else { 2 };
+        quarters[south] |= west.iter().any(|h| *h != NODATA);
+        quarters[south + 1] |= east.iter().any(|h| *h != NODATA);
+    }
+    Ok(Tile { size, heights, stats, quarters })
+}
+
+/// How many diamonds have a payload: those of a full source, and of these the share of squares in which the
+/// tiles have a height.
+fn diamonds(forest: &Forest, grid: &Grid, tiles: &[Tile]) -> u64 {
+    let quarters = tiles.iter().flat_map(|tile| {
+        // Quarters beyond the source's border do not count.
+        let inside = [0, 1, 2, 3].map(|q| tile.size[0] > q % 2 * TILE / 2 && tile.size[1] > q / 2 * TILE / 2);
+        tile.quarters.into_iter().zip(inside).filter(|(_, inside)| *inside).map(|(valid, _)| valid)
+    });
+    let share = |all: &[bool]| all.iter().filter(|valid| **valid).count() as f64 / all.len().max(1) as f64;
+    let fine = share(&quarters.collect::<Vec<_>>());
+    let coarse = share(&tiles.iter().map(|tile| tile.stats.valid > 0).collect::<Vec<_>>());
+    let [w, h] = [grid.width, grid.height].map(|n| u64::from(n.saturating_sub(1).max(1)));
+    let mut sum = 0.0;
+    for level in (0..forest.levels()).step_by(2) {
+        let side = 1u64 << (forest.root_log2() - level / 2);
+        // Squares; and sides of squares, which need not be all in the source for their diamonds to touch it.
+        let squares = |n: u64| n.div_ceil(side);
+        let lines = |n: u64| (n + side / 2 - 1) / side + 1;
+        let both = squares(w) * squares(h) + squares(w) * lines(h) + lines(w) * squares(h);
+        sum += both as f64 * if side <= u64::from(TILE / 2) { fine } else { coarse };
+    }
+    sum.round() as u64
+}
+
+/// Builds a tile in a temporary folder; the bytes of its payloads, and how long coding and comparing took.
+fn build_tile(tile: &Tile, grid: &Grid, options: &Options) -> Result<(f64, Duration), BuildError> {
+    let temporary = |error| BuildError::Work { path: std::env::temp_dir(), error };
+    let folder = tempfile::tempdir().map_err(temporary)?;
+    let writer = Writer::create(folder.path())?;
+    let failed = failure(&writer);
+    let [width, height] = tile.size;
+    let grid = Grid { width, height, ..grid.clone() };
+    let forest = forest_of(&grid, options)?;
+    let plan = Plan::new(forest, u64::MAX / 2)?;
+    let canvas = Canvas::create(writer.work_folder(), width, height, plan.coarsest()).map_err(&failed)?;
+    canvas.write_rows(0, &tile.heights).map_err(&failed)?;
+    let fine_step = fine_step(options.max_error, &tile.stats)?;
+    let coding = coding(&plan, &canvas, options.rule, fine_step)?;
+    let progress = Progress::hidden();
+    let journal = Journal::create(writer.work_folder(), &[0; 32], Duration::MAX).map_err(&failed)?;
+    let work = Work { writer: &writer, journal, progress: &progress, chunks: 1 };
+    let build = Build {
+        plan,
+        canvas,
+        coding,
+        work: &work,
+        tallies: Mutex::new(Tallies::new(forest)),
+        before: HashSet::new(),
+        done: AtomicU64::new(0),
+        grid: &grid,
+    };
+    let started = Instant::now();
+    let coarse = build.coarse_levels()?;
+    build.chunks(&coarse)?;
+    let took = started.elapsed();
+    let tallies = build.tallies.lock().unwrap_or_else(std::sync::PoisonError::into_inner).take();
+    let [w, h] = forest.size();
+    let bytes = (0..forest.levels()).flat_map(|level| forest.diamonds(level)).map(|d| {
+        let bytes = f64::from(tallies.of.get(d).bytes);
+        // In the whole source the halves on both sides of a tile's border are one diamond.
+        let [x, y] = d.centre();
+        let half = x == 0 || y == 0 || x == w || y == h;
+        bytes - if half { bytes.min(FIXED_BYTES) / 2.0 } else { 0.0 }
+    });
+    Ok((bytes.sum(), took))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_spread_is_even_and_of_the_size_asked_for() {
+        for (all, count) in [(5, 9), (9, 9), (10, 9), (1000, 64), (65, 64), (7, 1)] {
+            let kept = spread((0..all).collect(), count);
+            assert_eq!(kept.len(), count.min(all), "{count} of {all}");
+            let gaps: Vec<usize> = kept.windows(2).map(|w| w[1] - w[0]).collect();
+            let (least, most) = (gaps.iter().min(), gaps.iter().max());
+            assert!(least.zip(most).is_none_or(|(l, m)| m - l <= 1), "{count} of {all}: {kept:?}");
+        }
+    }
+}

@@ -1,0 +1,140 @@
+//! The index: errors and ranges saturated from the finest level up, pages, and the layer's description.
+
+#![allow(clippy::cast_possible_truncation, reason = "metres are rounded to f32 on purpose")]
+
+use super::tallies::{PerDiamond, Tallies, Tally};
+use super::transcribe::Stats;
+use super::{Build, BuildError, Options};
+use crate::store::{Key, Kind as BlobKind};
+use diamantina_protocol::bintree::Forest;
+use diamantina_protocol::index::{self, Entry};
+use diamantina_protocol::message::Layer;
+use rayon::prelude::*;
+
+/// What coding gave, in numbers.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Sums {
+    /// Diamonds with a payload.
+    pub(super) diamonds: u64,
+    /// Bytes of payloads.
+    pub(super) point_bytes: u64,
+    /// Bytes of pages.
+    pub(super) index_bytes: u64,
+}
+
+impl Build<'_> {
+    /// Saturates errors and ranges, writes the index, and describes the layer.
+    pub(super) fn index(
+        &self,
+        tallies: Tallies,
+        options: &Options,
+        stats: &Stats,
+    ) -> Result<(Layer, Sums), BuildError> {
+        let forest = &self.plan.forest;
+        let cell = self.grid.cell;
+        // Room for the rounding of metres, where they are not whole.
+        let slack = if stats.quantum.fract() == 0.0 && stats.rounding == 0.0 { 1.0 } else { 1.0 + 1e-9 };
+        let finest = up((tallies.finest * stats.quantum + stats.rounding) * slack);
+        let written = tallies.of.values().filter(|t| t.bytes > 0);
+        let (diamonds, point_bytes) =
+            written.fold((0, 0), |(n, sum): (u64, u64), t| (n + 1, sum + u64::from(t.bytes)));
+        let metres = |level: u32, tally: Tally| {
+            let own = tally.vertical * stats.quantum + stats.rounding;
+            let apart = if tally.outline { hypotenuse(forest, level, cell) } else { 0.0 };
+            let compared = tally.vertical > 0.0 || tally.outline;
+            if compared { up((own + apart) * slack) } else { 0.0 }
+        };
+        let entries = saturated(forest, tallies.of, finest, metres);
+        let index_bytes = self.pages(&entries)?;
+        let offset = self.grid.height_offset;
+        let layer = Layer {
+            name: options.layer.clone(),
+            kind: options.kind,
+            forest: *forest,
+            origin: self.grid.origin,
+            cell,
+            samples: [self.grid.width, self.grid.height],
+            valid_samples: stats.valid,
+            quantum: stats.quantum,
+            height_offset: offset,
+            heights: [
+                f64::from(stats.low) * stats.quantum + offset,
+                f64::from(stats.high) * stats.quantum + offset,
+            ],
+            max_error: options.max_error,
+            finest_error: finest,
+            encodings: vec!["points".to_owned()],
+            coding: self.coding.clone(),
+            bytes: point_bytes + index_bytes,
+            resampled: self.grid.resampled,
+            errors: "exact".to_owned(),
+        };
+        Ok((layer, Sums { diamonds, point_bytes, index_bytes }))
+    }
+
+    /// Writes the pages; their bytes.
+    fn pages(&self, entries: &PerDiamond<Entry>) -> Result<u64, BuildError> {
+        let forest = &self.plan.forest;
+        let pages = index::pages(forest);
+        let progress = self.work.progress;
+        progress.stage("index", "pages", pages.into(), 0);
+        let page = |page: u32| {
+            if progress.is_stopping() {
+                return Err(self.interrupted());
+            }
+            let diamonds = index::page_diamonds(forest, page).unwrap_or_default();
+            let list: Vec<Entry> = diamonds.iter().map(|d| entries.get(*d)).collect();
+            let blob = zstd::bulk::compress(&index::encode(&list), 12).map_err(self.work.failure())?;
+            let key = Key { layer: 0, kind: BlobKind::Index, a: page, b: 0 };
+            self.work.writer.put(key, u64::from(page), &blob)?;
+            progress.advance(1);
+            Ok(blob.len() as u64)
+        };
+        (0..pages).into_par_iter().map(page).sum()
+    }
+}
+
+/// The largest length of a micro-hypotenuse of a level, in metres.
+fn hypotenuse(forest: &Forest, level: u32, cell: [f64; 2]) -> f64 {
+    let [along, across] = forest.hypotenuse(level);
+    if across > 0.0 { (along * cell[0]).hypot(across * cell[1]) } else { along * cell[0].max(cell[1]) }
+}
+
+/// What the index says of each diamond: parents declare at least what their children do.
+fn saturated(
+    forest: &Forest,
+    mut tallies: PerDiamond<Tally>,
+    finest: f32,
+    metres: impl Fn(u32, Tally) -> f32,
+) -> PerDiamond<Entry> {
+    let mut entries = PerDiamond::new(*forest, Entry::EMPTY);
+    for level in (0..forest.levels()).rev() {
+        for d in forest.diamonds(level) {
+            let tally = tallies.get(d);
+            let mut entry = Entry { bytes: tally.bytes, error_metres: metres(level, tally), ..Entry::EMPTY };
+            if tally.low <= tally.high {
+                (entry.low, entry.high) = (tally.low, tally.high);
+            }
+            for child in forest.children(d).into_iter().flatten().map(|c| entries.get(c)) {
+                if !child.is_empty() {
+                    entry.error_metres = entry.error_metres.max(child.error_metres);
+                    let fresh = entry.is_empty();
+                    entry.low = if fresh { child.low } else { entry.low.min(child.low) };
+                    entry.high = if fresh { child.high } else { entry.high.max(child.high) };
+                }
+            }
+            if !entry.is_empty() {
+                entry.error_metres = index::declared(entry.error_metres.max(finest));
+            }
+            *entries.at(d) = entry;
+        }
+        tallies.forget(level);
+    }
+    entries
+}
+
+/// The least `f32` at or above a value.
+fn up(value: f64) -> f32 {
+    let near = value as f32;
+    if f64::from(near) < value { near.next_up() } else { near }
+}

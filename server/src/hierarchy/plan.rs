@@ -1,0 +1,83 @@
+//! How the forest is divided so that a build stays within its memory.
+//!
+//! | what | bytes | while |
+//! |---|---|---|
+//! | the program, its threads, the source's cache of strips and tiles | 96 MiB | always |
+//! | rows of the source | an eighth of what is granted | reading |
+//! | coarse levels: heights of each, blocks of the last two | 40 a point of the chunks' lattice | coding |
+//! | a chunk's windows, blocks and surfaces, for each worker | 40 a cell | coding |
+//! | a diamond's tally, place in the spool, entry, place in a pack, line of the directory | 136 | coding, then publishing |
+
+use super::BuildError;
+use super::tallies::places_of_all;
+use crate::chunks::Chunks;
+use diamantina_protocol::bintree::Forest;
+
+/// What does not grow with the source.
+const BASE_BYTES: u64 = 96 << 20;
+/// See the table.
+const COARSE_POINT_BYTES: u64 = 40;
+/// Measured, halo included.
+const CHUNK_CELL_BYTES: u64 = 40;
+/// 24 (tally) + 16 (entry) + 40 (spool) + 40 (pack) + 32 (directory), less what is given back in between.
+const DIAMOND_BYTES: u64 = 136;
+
+/// How the forest is divided for the build.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Plan {
+    pub(super) forest: Forest,
+    /// The squares that are built one by one.
+    pub(super) chunks: Chunks,
+    /// Rows that are read at once, as a share of the memory.
+    pub(super) band_bytes: u64,
+    /// Chunks that may be worked on at once.
+    pub(super) workers: usize,
+    /// The most memory that coding may take, in bytes.
+    pub(super) memory: u64,
+}
+
+impl Plan {
+    pub(super) fn new(forest: Forest, memory: u64) -> Result<Self, BuildError> {
+        let [w, h] = forest.size().map(u64::from);
+        let threads = rayon::current_num_threads() as u64;
+        // Chunks of 1024 cells, or larger where the coarse levels would otherwise not fit.
+        let chunk_logs = 10.max(forest.patch_log2() + 2).min(forest.root_log2())..=forest.root_log2();
+        let coarse_bytes = |chunk_log2: u32| {
+            let spacing = chunk_log2 - forest.patch_log2();
+            ((w >> spacing) + 1) * ((h >> spacing) + 1) * COARSE_POINT_BYTES
+        };
+        let chunk_bytes = |chunk_log2: u32| CHUNK_CELL_BYTES << (2 * chunk_log2);
+        let always =
+            |chunk_log2: u32| BASE_BYTES + coarse_bytes(chunk_log2) + places_of_all(&forest) * DIAMOND_BYTES;
+        let needed = |chunk_log2: u32| {
+            // The coarse levels should take no more than a quarter, where larger chunks could still help.
+            let share = if chunk_log2 < forest.root_log2() { 4 } else { 1 };
+            (always(chunk_log2) + chunk_bytes(chunk_log2)).max(share * coarse_bytes(chunk_log2))
+        };
+        let Some(chunk_log2) = chunk_logs.clone().find(|log2| needed(*log2) <= memory) else {
+            let least = chunk_logs.map(needed).min().unwrap_or(u64::MAX);
+            return Err(BuildError::Memory { asked: memory, needed: least });
+        };
+        let (always, chunk_bytes) = (always(chunk_log2), chunk_bytes(chunk_log2));
+        let workers = ((memory - always) / chunk_bytes).clamp(1, threads);
+        let chunks = Chunks::new(forest, chunk_log2);
+        Ok(Self {
+            forest,
+            chunks,
+            band_bytes: memory / 8 / threads,
+            workers: usize::try_from(workers).unwrap_or(1),
+            memory: always + workers * chunk_bytes,
+        })
+    }
+
+    /// Base-2 logarithm of the spacing of the lattice of a level: that of the canvas plane with all its
+    /// points. Of an odd level half of the plane's points are its own.
+    pub(super) fn spacing_log2(&self, level: u32) -> u32 {
+        self.forest.root_log2() - self.forest.patch_log2() - level.div_ceil(2)
+    }
+
+    /// Base-2 logarithm of the spacing of the coarsest plane of the canvas.
+    pub(super) fn coarsest(&self) -> u32 {
+        self.spacing_log2(self.chunks.level())
+    }
+}
