@@ -141,6 +141,11 @@ fn a_wrong_build_says_what_is_wrong_and_what_to_do() {
         text.replace("xllcorner 0", "xllcorner 204.9").replace("yllcorner 0", "yllcorner 19.6"),
     )
     .unwrap();
+    // A void of another value than the one that the file declares.
+    let heights: Vec<String> =
+        (0..6400).map(|i| if i == 777 { -9999 } else { 100 + i % 53 }.to_string()).collect();
+    let head = "ncols 80\nnrows 80\nxllcorner 0\nyllcorner 0\ncellsize 10\nNODATA_value -1\n";
+    std::fs::write(file("void.asc"), format!("{head}{}\n", heights.join(" "))).unwrap();
     let mut png = png::Encoder::new(std::fs::File::create(file("picture.png")).unwrap(), 80, 80);
     png.set_color(png::ColorType::Grayscale);
     png.set_depth(png::BitDepth::Eight);
@@ -165,6 +170,8 @@ fn a_wrong_build_says_what_is_wrong_and_what_to_do() {
         ),
         // Files that do not fit the options.
         ("{}/ten.asc --nodata 5", 1, &["ten.asc", "all 6400 samples are nodata", "--nodata"]),
+        ("{}/void.asc", 2, &["void.asc", "100 to 152", "say --nodata -9999", "--nodata nan"]),
+        ("{}/void.asc --nodata 7", 2, &["void.asc", "say --nodata -9999"]),
         ("{}/degrees.asc", 2, &["degrees.asc", "look like degrees", "--assume-crs EPSG:4326", "--cell"]),
         ("{}/degrees.asc --crs source", 2, &["degrees.asc", "look like degrees", "--assume-crs EPSG:4326"]),
         ("{}/ten.asc --crs EPSG:32633", 2, &["ten.asc", "a source with a CRS", "leave --crs out"]),

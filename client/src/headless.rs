@@ -315,14 +315,31 @@ fn report(
     }
 }
 
-/// Writes a picture as PNG.
+/// Writes a picture as PNG: whole, or not at all. What is at `path` stays until it can be replaced.
 ///
 /// # Errors
 /// When the file cannot be written.
 pub fn save(picture: &Picture, path: &Path) -> Result<(), HeadlessError> {
     let failed = file_error("write the picture", path);
-    let file = File::create(path).map_err(&failed)?;
-    write_png(picture, BufWriter::new(file)).map_err(|e| failed(std::io::Error::other(e)))
+    if path.exists() && !path.is_file() {
+        // A device or a pipe takes bytes as they come.
+        return write(picture, path).map_err(failed);
+    }
+    let mut aside = path.as_os_str().to_owned();
+    aside.push(".part");
+    let aside = Path::new(&aside);
+    let moved = write(picture, aside).and_then(|()| std::fs::rename(aside, path));
+    if moved.is_err() {
+        // It is of no use to anybody; the error says why.
+        let _ = std::fs::remove_file(aside);
+    }
+    moved.map_err(failed)
+}
+
+fn write(picture: &Picture, path: &Path) -> std::io::Result<()> {
+    let mut out = BufWriter::new(File::create(path)?);
+    write_png(picture, &mut out).map_err(std::io::Error::other)?;
+    out.flush()
 }
 
 /// A path through a scene: eyes and targets at moments.
@@ -606,6 +623,21 @@ mod tests {
 
     fn corners([low, high]: [DVec3; 2]) -> [DVec3; 8] {
         std::array::from_fn(|i| DVec3::select(glam::BVec3::new(i & 1 > 0, i & 2 > 0, i & 4 > 0), high, low))
+    }
+
+    #[test]
+    fn a_picture_is_written_whole_or_not_at_all() {
+        let folder = tempfile::tempdir().unwrap();
+        let picture = Picture { size: [64, 64], pixels: (0..=255).cycle().take(4 * 64 * 64).collect() };
+        let path = folder.path().join("a.png");
+        save(&picture, &path).unwrap();
+        let before = std::fs::read(&path).unwrap();
+        // A folder in the way of what is written aside.
+        std::fs::create_dir(folder.path().join("a.png.part")).unwrap();
+        assert!(save(&Picture { size: [1, 1], pixels: vec![9; 4] }, &path).is_err());
+        assert_eq!(std::fs::read(&path).unwrap(), before, "the old one stays");
+        let full = save(&picture, Path::new("/dev/full")).unwrap_err().to_string();
+        assert!(full.contains("/dev/full") && full.contains("write the picture"), "{full}");
     }
 
     #[test]

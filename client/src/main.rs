@@ -8,7 +8,7 @@ use diamantina_client::render::{self, Background, Colours, Look, Sun};
 use diamantina_client::terrain::{self, Terrain, TerrainError};
 use diamantina_protocol::message::Scene;
 use glam::DVec3;
-use std::io::Write;
+use std::io::{IsTerminal, Write};
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -198,7 +198,10 @@ fn shown(printed: std::io::Result<()>) -> std::io::Result<()> {
 fn main() -> ExitCode {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| "warn,wgpu_hal=error,wgpu_core=error".into());
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    let colours =
+        std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty());
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours);
+    log.with_writer(std::io::stderr).init();
     let result = match Cli::parse().command {
         Command::Render(args) => render(&args),
         Command::Fly(args) => fly(&args),

@@ -9,7 +9,7 @@ use diamantina_server::inspect::{self, Inspection};
 use diamantina_server::progress::Progress;
 use diamantina_server::store::{Store, StoreError};
 use diamantina_server::{curve, demo, http, ingest};
-use std::io::Write;
+use std::io::{IsTerminal, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -192,7 +192,10 @@ fn shown(printed: std::io::Result<()>) -> std::io::Result<()> {
 
 fn main() -> ExitCode {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| "warn".into());
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    let colours =
+        std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty());
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours);
+    log.with_writer(std::io::stderr).init();
     let result = match Cli::parse().command {
         Command::Build(args) => build(*args),
         Command::Serve(args) => serve(&args.stores, args.listen),

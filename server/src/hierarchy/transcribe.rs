@@ -153,6 +153,7 @@ pub(super) fn transcribe(
     if stats.valid == 0 {
         return Err(BuildError::AllNodata(width * u64::from(grid.height)));
     }
+    source.check_nodata()?;
     Ok(stats)
 }
 

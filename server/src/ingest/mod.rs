@@ -23,6 +23,7 @@ mod png;
 mod raster;
 mod reproject;
 mod samples;
+mod sentinels;
 #[cfg(test)]
 mod tests;
 mod tiff_header;
@@ -74,7 +75,7 @@ pub struct Options {
     /// Metres of height at value 0 [default: from the file, else 0]
     #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
     pub height_offset: Option<f64>,
-    /// The value that means "no data", instead of the file's
+    /// The value that means "no data", instead of the file's; nan: all values are heights
     #[arg(long, value_name = "VALUE", allow_negative_numbers = true)]
     pub nodata: Option<f64>,
     /// Read the files as bare little-endian samples, rows from the north; types u8 i16 u16 i32 u32 f32 f64
@@ -198,6 +199,8 @@ pub struct Source {
     identity: String,
     mosaic: Mosaic,
     reprojection: Option<Reprojection>,
+    /// Whether the user says that no value stands for "no data".
+    all_heights: bool,
 }
 
 impl fmt::Debug for Source {
@@ -226,7 +229,8 @@ pub fn open(paths: &[PathBuf], options: &Options) -> std::result::Result<Source,
     let (grid, reprojection) = frame(first, &mosaic, options)?;
     check_grid(first, &grid)?;
     let identity = identity(paths, options, &grid)?;
-    Ok(Source { grid, identity, mosaic, reprojection })
+    let all_heights = options.nodata.is_some_and(f64::is_nan);
+    Ok(Source { grid, identity, mosaic, reprojection, all_heights })
 }
 
 /// What tells this source from others without reading it.
@@ -246,6 +250,23 @@ impl Source {
     #[must_use]
     pub fn identity(&self) -> &str {
         &self.identity
+    }
+
+    /// Whether, among the values read so far, there was one that usually means "no data" and that nobody
+    /// declared.
+    ///
+    /// # Errors
+    /// When there was: it would become a pit or a spire.
+    pub fn check_nodata(&self) -> std::result::Result<(), IngestError> {
+        match self.mosaic.suspect() {
+            Some((file, value, [low, high])) if !self.all_heights => Err(bad_options(
+                file,
+                format!("heights about as far apart as the others, which are {low} to {high}"),
+                format!("{value}, which usually means \"no data\" and is not declared here"),
+                format!("say --nodata {value}; or, if it is a height, --nodata nan"),
+            )),
+            _ => Ok(()),
+        }
     }
 
     /// The lattice that windows refer to.
@@ -408,7 +429,9 @@ fn open_raw(path: &Path, file: File, shape: RawShape) -> Result<Raster> {
 
 /// Applies what the command line says of values.
 fn override_values(raster: &mut Raster, options: &Options) -> Result<()> {
-    if let Some(nodata) = options.nodata {
+    if options.nodata.is_some_and(f64::is_nan) {
+        raster.nodata = None;
+    } else if let Some(nodata) = options.nodata {
         raster.nodata = Some(raster.dtype.hold(nodata).ok_or_else(|| {
             bad_options(
                 &raster.file,
