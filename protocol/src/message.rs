@@ -596,7 +596,7 @@ mod tests {
             let error = parse_stream(pairs(text)).unwrap_err().to_string();
             assert!(error.contains(word), "{text}: {error}");
         }
-        let many = vec!["1,0,0"; SIDES_MAX + 1].join(";");
+        let many = ["1,0,0"; SIDES_MAX + 1].join(";");
         assert!(parse_stream([("eye", "0,0,0"), ("angle", "1"), ("sides", &many)]).is_err());
         // A long value is not repeated whole.
         assert!(parse_stream([("error", "9,".repeat(5000).as_str())]).unwrap_err().to_string().len() < 200);
