@@ -28,7 +28,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     /// Turn DEM files into a store of diamonds
-    Build(BuildArgs),
+    Build(Box<BuildArgs>),
     /// Offer stores over HTTP
     Serve(ServeArgs),
     /// Say what a store holds
@@ -194,7 +194,7 @@ fn main() -> ExitCode {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| "warn".into());
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
     let result = match Cli::parse().command {
-        Command::Build(args) => build(args),
+        Command::Build(args) => build(*args),
         Command::Serve(args) => serve(&args.stores, args.listen),
         Command::Inspect(args) => inspect_store(&args),
         Command::Demo(args) => demonstrate(&args),

@@ -1,8 +1,9 @@
 //! What a build would take and give, from a bounded sample of the source: a dry run.
 //!
-//! The source is cut into tiles of 256 x 256 cells. Some are read, to know how much of it has heights; some
-//! of those are built as if each were a source of its own, by the same code, in a temporary folder. What a
-//! tile's root costs stands for the coarser levels that it has not: both code one point in sixteen (n = 64).
+//! The source is cut into tiles of 4 x 4 patches. Some are read, to know how much of it has heights; some of
+//! those are built as if each were a source of its own, by the same code, in a temporary folder. Of their four
+//! levels the finer three, which add 7 of 8 points, are taken as they are; what the coarser ones cost
+//! follows from how the cost falls from level to level.
 
 #![allow(
     clippy::cast_possible_truncation,
@@ -23,6 +24,7 @@ use crate::progress::Progress;
 use crate::store::Writer;
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
+use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::points;
 use rayon::prelude::*;
 use std::collections::HashSet;
@@ -30,15 +32,20 @@ use std::sync::Mutex;
 use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant};
 
-/// Cells along a side of a tile.
-const TILE: u32 = 256;
-/// Tiles that are read: 17 million samples.
-const READ_MAX: usize = 256;
-/// Tiles that are built: 4 million samples.
-const BUILT_MAX: usize = 64;
+/// Base-2 logarithm of the patches along a side of a tile.
+const TILE_LOG2: u8 = 2;
+/// Samples that are read.
+const READ_MAX: usize = 1 << 24;
+/// Samples that are built.
+const BUILT_MAX: usize = 1 << 22;
 /// What a whole build takes for each sample, compared with a tile's: diamonds that straddle chunks are coded
 /// on both sides, there are more levels to compare, and blobs are laid into packs. Measured.
-const WHOLE_TO_TILE: f64 = 1.25;
+const WHOLE_TO_TILE: f64 = 1.4;
+/// What a build takes however small the source: mostly waiting for the disk to sync. Measured.
+const FIXED_SECONDS: f64 = 0.1;
+/// The levels of one step of the quadtree cost a quarter of those of the next finer one on ground that is flat
+/// or noise, and at most this share where relief grows with distance.
+const COARSER_MAX: f64 = 0.8;
 /// What a payload takes whatever it holds: its header and the end of its symbols.
 const FIXED_BYTES: f64 = points::HEADER_BYTES as f64 + 4.0;
 /// What the journal takes for a diamond.
@@ -87,9 +94,13 @@ pub fn estimate(source: &Source, options: &Options) -> Result<Estimate, BuildErr
     let plan = Plan::new(forest, options.memory)?;
     let quantum = find_quantum(source, options)?;
     let started = Instant::now();
-    let chosen = spread(tiles(grid), READ_MAX);
-    let mut tiles: Vec<Tile> =
-        chosen.par_iter().map(|corner| read_tile(source, *corner, quantum)).collect::<Result<_, _>>()?;
+    let side = 1u32 << (options.patch_log2 + TILE_LOG2);
+    let tile_samples = (side * side) as usize;
+    let chosen = spread(tiles(grid, side), READ_MAX / tile_samples);
+    let mut tiles: Vec<Tile> = chosen
+        .par_iter()
+        .map(|corner| read_tile(source, *corner, side, quantum))
+        .collect::<Result<_, _>>()?;
     let reading = started.elapsed();
     let samples = u64::from(grid.width) * u64::from(grid.height);
     let sum = |tiles: &[Tile]| {
@@ -97,19 +108,24 @@ pub fn estimate(source: &Source, options: &Options) -> Result<Estimate, BuildErr
     };
     let (read, valid) = sum(&tiles);
     let valid_samples = (samples as f64 * valid as f64 / read as f64).round() as u64;
-    let diamonds = diamonds(&forest, grid, &tiles);
+    let diamonds = diamonds(&forest, grid, &tiles, side);
 
     tiles.retain(|tile| tile.stats.valid > 0);
-    let tiles = spread(tiles, BUILT_MAX);
+    let tiles = spread(tiles, BUILT_MAX / tile_samples);
     let (built, built_valid) = sum(&tiles);
-    let each: Vec<(f64, Duration)> =
+    let each: Vec<(Levels, Duration)> =
         tiles.par_iter().map(|tile| build_tile(tile, grid, options)).collect::<Result<_, BuildError>>()?;
-    let bytes: f64 = each.iter().map(|(bytes, _)| bytes).sum();
+    let mut levels = Levels::default();
+    for (level, sum) in levels.iter_mut().enumerate() {
+        *sum = each.iter().map(|(levels, _)| levels[level]).sum();
+    }
+    let bytes = of_all_levels(levels);
     let workers = rayon::current_num_threads().min(plan.workers);
     let building = each.iter().map(|(_, took)| *took).sum::<Duration>() / workers as u32;
     let per = |part: f64, of: u64| if of == 0 { 0.0 } else { part / of as f64 };
     let point_bytes = (per(bytes, built_valid) * valid_samples as f64).round() as u64;
-    let seconds = samples as f64 * per(reading.as_secs_f64(), read)
+    let seconds = FIXED_SECONDS
+        + samples as f64 * per(reading.as_secs_f64(), read)
         + valid_samples as f64 * per(building.as_secs_f64(), built_valid) * WHOLE_TO_TILE;
     Ok(Estimate {
         samples,
@@ -126,15 +142,15 @@ pub fn estimate(source: &Source, options: &Options) -> Result<Estimate, BuildErr
 }
 
 /// South-west samples of all tiles, in Morton order: neighbours in the list are neighbours on the ground.
-fn tiles(grid: &Grid) -> Vec<[u32; 2]> {
-    let count = |samples: u32| samples.saturating_sub(1).max(1).div_ceil(TILE);
+fn tiles(grid: &Grid, side: u32) -> Vec<[u32; 2]> {
+    let count = |samples: u32| samples.saturating_sub(1).max(1).div_ceil(side);
     let (columns, rows) = (count(grid.width), count(grid.height));
     let mut all: Vec<[u32; 2]> = (0..rows).flat_map(|j| (0..columns).map(move |i| [i, j])).collect();
     let interleaved = |[i, j]: [u32; 2]| {
         (0..32).map(|bit| (u64::from(i >> bit & 1) | u64::from(j >> bit & 1) << 1) << (2 * bit)).sum::<u64>()
     };
     all.sort_unstable_by_key(|tile| interleaved(*tile));
-    all.into_iter().map(|tile| tile.map(|w| w * TILE)).collect()
+    all.into_iter().map(|tile| tile.map(|w| w * side)).collect()
 }
 
 /// At most `count` of a list, at even distances.
@@ -153,16 +169,16 @@ fn spread<T>(list: Vec<T>, count: usize) -> Vec<T> {
     kept.map(|(_, item)| item).collect()
 }
 
-fn read_tile(source: &Source, [x, y]: [u32; 2], quantum: f64) -> Result<Tile, BuildError> {
+fn read_tile(source: &Source, [x, y]: [u32; 2], side: u32, quantum: f64) -> Result<Tile, BuildError> {
     let grid = source.grid();
-    let size = [(grid.width - x).min(TILE + 1), (grid.height - y).min(TILE + 1)];
+    let size = [(grid.width - x).min(side + 1), (grid.height - y).min(side + 1)];
     let mut values = Vec::new();
     source.read(x, y, size[0], size[1], &mut values)?;
     let (heights, stats) = to_quanta(&values, grid, quantum)?;
     let mut quarters = [false; 4];
     for (row, j) in heights.chunks_exact(size[0] as usize).zip(0u32..) {
-        let (west, east) = row.split_at(row.len().min(TILE as usize / 2));
-        let south = if j < TILE / 2 { 0 } else { 2 };
+        let (west, east) = row.split_at(row.len().min(side as usize / 2));
+        let south = if j < side / 2 { 0 } else { 2 };
         quarters[south] |= west.iter().any(|h| *h != NODATA);
         quarters[south + 1] |= east.iter().any(|h| *h != NODATA);
     }
@@ -171,10 +187,11 @@ fn read_tile(source: &Source, [x, y]: [u32; 2], quantum: f64) -> Result<Tile, Bu
 
 /// How many diamonds have a payload: those of a full source, and of these the share of squares in which the
 /// tiles have a height.
-fn diamonds(forest: &Forest, grid: &Grid, tiles: &[Tile]) -> u64 {
+fn diamonds(forest: &Forest, grid: &Grid, tiles: &[Tile], tile_side: u32) -> u64 {
     let quarters = tiles.iter().flat_map(|tile| {
         // Quarters beyond the source's border do not count.
-        let inside = [0, 1, 2, 3].map(|q| tile.size[0] > q % 2 * TILE / 2 && tile.size[1] > q / 2 * TILE / 2);
+        let inside = [0, 1, 2, 3]
+            .map(|q| tile.size[0] > q % 2 * tile_side / 2 && tile.size[1] > q / 2 * tile_side / 2);
         tile.quarters.into_iter().zip(inside).filter(|(_, inside)| *inside).map(|(valid, _)| valid)
     });
     let share = |all: &[bool]| all.iter().filter(|valid| **valid).count() as f64 / all.len().max(1) as f64;
@@ -188,20 +205,32 @@ fn diamonds(forest: &Forest, grid: &Grid, tiles: &[Tile]) -> u64 {
         let squares = |n: u64| n.div_ceil(side);
         let lines = |n: u64| (n + side / 2 - 1) / side + 1;
         let both = squares(w) * squares(h) + squares(w) * lines(h) + lines(w) * squares(h);
-        sum += both as f64 * if side <= u64::from(TILE / 2) { fine } else { coarse };
+        sum += both as f64 * if side <= u64::from(tile_side / 2) { fine } else { coarse };
     }
     sum.round() as u64
 }
 
+/// Bytes of payloads of the levels of a tile, coarse first. Level 0 holds the root's own points too, coded as
+/// nowhere else.
+type Levels = [f64; 2 * TILE_LOG2 as usize];
+
+/// The bytes of all levels of a source, from those of its tiles.
+fn of_all_levels([_, one, two, three]: Levels) -> f64 {
+    // Two levels are one step of the quadtree; odd levels compare with odd ones.
+    let share = if three > 0.0 { (one / three).clamp(0.25, COARSER_MAX) } else { 0.25 };
+    three + (one + two) / (1.0 - share)
+}
+
 /// Builds a tile in a temporary folder; the bytes of its payloads, and how long coding and comparing took.
-fn build_tile(tile: &Tile, grid: &Grid, options: &Options) -> Result<(f64, Duration), BuildError> {
+fn build_tile(tile: &Tile, grid: &Grid, options: &Options) -> Result<(Levels, Duration), BuildError> {
     let temporary = |error| BuildError::Work { path: std::env::temp_dir(), error };
     let folder = tempfile::tempdir().map_err(temporary)?;
     let writer = Writer::create(folder.path())?;
     let failed = failure(&writer);
     let [width, height] = tile.size;
     let grid = Grid { width, height, ..grid.clone() };
-    let forest = forest_of(&grid, options)?;
+    let forest = Forest::new(options.patch_log2 + TILE_LOG2, options.patch_log2, [1, 1])
+        .map_err(|error| BuildError::Forest { width, height, error })?;
     let plan = Plan::new(forest, u64::MAX / 2)?;
     let canvas = Canvas::create(writer.work_folder(), width, height, plan.coarsest()).map_err(&failed)?;
     canvas.write_rows(0, &tile.heights).map_err(&failed)?;
@@ -226,19 +255,32 @@ fn build_tile(tile: &Tile, grid: &Grid, options: &Options) -> Result<(f64, Durat
     let took = started.elapsed();
     let tallies = build.tallies.lock().unwrap_or_else(std::sync::PoisonError::into_inner).take();
     let [w, h] = forest.size();
-    let bytes = (0..forest.levels()).flat_map(|level| forest.diamonds(level)).map(|d| {
+    let bytes = |d: Diamond| {
         let bytes = f64::from(tallies.of.get(d).bytes);
         // In the whole source the halves on both sides of a tile's border are one diamond.
         let [x, y] = d.centre();
         let half = x == 0 || y == 0 || x == w || y == h;
         bytes - if half { bytes.min(FIXED_BYTES) / 2.0 } else { 0.0 }
-    });
-    Ok((bytes.sum(), took))
+    };
+    let mut levels = Levels::default();
+    for (level, sum) in (0..forest.levels()).zip(&mut levels) {
+        *sum = forest.diamonds(level).map(bytes).sum();
+    }
+    Ok((levels, took))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn coarser_levels_follow_from_finer_ones() {
+        // Noise: each level costs half of the next; the root's own points do not count.
+        assert!((of_all_levels([1e9, 1.0, 2.0, 4.0]) - 8.0).abs() < 1e-9);
+        assert!(of_all_levels([0.0; 4]) == 0.0);
+        // Whatever the tiles say, it stays finite.
+        assert!(of_all_levels([0.0, 9.0, 1.0, 1.0]) < 51.1);
+    }
 
     #[test]
     fn a_spread_is_even_and_of_the_size_asked_for() {

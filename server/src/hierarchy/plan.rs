@@ -5,7 +5,7 @@
 //! | the program, its threads, the source's cache of strips and tiles | 96 MiB | always |
 //! | rows of the source | an eighth of what is granted | reading |
 //! | coarse levels: heights of each, blocks of the last two | 40 a point of the chunks' lattice | coding |
-//! | a chunk's windows, blocks and surfaces, for each worker | 40 a cell | coding |
+//! | a chunk, for each worker: windows 9, surface 4, blocks of two levels 8, a third for the allocator | 28 a cell | coding |
 //! | a diamond's tally, place in the spool, entry, place in a pack, line of the directory | 136 | coding, then publishing |
 
 use super::BuildError;
@@ -17,8 +17,8 @@ use diamantina_protocol::bintree::Forest;
 const BASE_BYTES: u64 = 96 << 20;
 /// See the table.
 const COARSE_POINT_BYTES: u64 = 40;
-/// Measured, halo included.
-const CHUNK_CELL_BYTES: u64 = 40;
+/// See the table; halo included, which is a quarter more at chunks of 1024 cells and less at larger ones.
+const CHUNK_CELL_BYTES: u64 = 28;
 /// 24 (tally) + 16 (entry) + 40 (spool) + 40 (pack) + 32 (directory), less what is given back in between.
 const DIAMOND_BYTES: u64 = 136;
 
@@ -79,5 +79,19 @@ impl Plan {
     /// Base-2 logarithm of the spacing of the coarsest plane of the canvas.
     pub(super) fn coarsest(&self) -> u32 {
         self.spacing_log2(self.chunks.level())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ten_thousand_million_samples_fit_the_memory_that_is_granted_by_default() {
+        let forest = Forest::covering(100_000, 100_000, 6).unwrap();
+        let granted = 2 << 30;
+        let plan = Plan::new(forest, granted).unwrap();
+        assert!(plan.memory <= granted, "{} bytes", plan.memory);
+        assert_eq!(plan.workers, rayon::current_num_threads().min(2), "two cores have work");
     }
 }
