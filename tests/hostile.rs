@@ -156,6 +156,7 @@ fn a_wrong_build_says_what_is_wrong_and_what_to_do() {
         ("{}/empty.tif", 1, &["empty.tif", "an empty file", "fetch it again"]),
         ("{}/notes.txt", 1, &["notes.txt", "diary", "--raw"]),
         ("{}/folder", 1, &["folder", "a directory", "name the files in it"]),
+        ("/dev/null", 1, &["/dev/null", "a pipe or device", "into a file first"]),
         ("{}/nowhere.tif", 1, &["nowhere.tif", "check the path"]),
         (
             "{}/short.raw --raw 100x100:f32 --cell 1",

@@ -107,7 +107,7 @@ impl Coding {
         self.fine_step
     }
 
-    /// Levels that these exponents serve; must equal [`Forest::levels`].
+    /// Levels that these exponents serve; must equal [`crate::bintree::Forest::levels`].
     #[must_use]
     pub fn levels(&self) -> u32 {
         self.exponents.len() as u32 - 1

@@ -163,15 +163,15 @@ impl Ground {
             let lines = [v + 1, inner - 1, inner, inner + 1].map(|v| &self.heights[v * row + 1..][..n + 1]);
             let [here, south, middle, north] = lines;
             let bends = &mut self.bends[v * (n + 1)..][..n + 1];
-            for u in 0..=n {
-                bends[u] = (south[u] - 2.0 * middle[u] + north[u]).abs();
+            for (bend, ((s, m), n)) in bends.iter_mut().zip(south.iter().zip(middle).zip(north)) {
+                *bend = (s - 2.0 * m + n).abs();
             }
-            let along = |u: usize| (here[u - 1] - 2.0 * here[u] + here[u + 1]).abs();
-            for u in 1..n {
-                bends[u] += along(u);
+            let along = |w: &[f32]| (w[0] - 2.0 * w[1] + w[2]).abs();
+            for (bend, line) in bends[1..n].iter_mut().zip(here.windows(3)) {
+                *bend += along(line);
             }
-            bends[0] += along(1);
-            bends[n] += along(n - 1);
+            bends[0] += along(&here[..3]);
+            bends[n] += along(&here[n - 2..]);
         }
     }
 
@@ -187,13 +187,13 @@ impl Ground {
         let weights = kernel.pairs();
         let around = self.around(v);
         let guess = &mut to.guess[..n];
-        for u in 0..n {
-            let (mean, pairs) = pairs(&around, u);
-            let mut sum = 0.25 * mean;
+        for (u, guess) in guess.iter_mut().enumerate() {
+            let (four, pairs) = pairs(&around, u);
+            let mut sum = 0.25 * four;
             for (w, pair) in weights.iter().zip(pairs) {
                 sum += w * pair;
             }
-            guess[u] = sum;
+            *guess = sum;
         }
         let [w_twist, w_bend, w_spread, ..] = kernel.activity();
         let [_, [_, a, b, _], [_, d, c, _], _] = around;

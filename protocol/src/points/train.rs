@@ -210,10 +210,10 @@ impl<const N: usize> Fit<N> {
         if self.count == 0.0 {
             return *prior;
         }
-        for i in 0..N {
+        for (i, prior) in prior.iter().enumerate() {
             let pull = (self.matrix[i][i] * PRIOR_SAMPLES / self.count).max(1e-12);
             self.matrix[i][i] += pull;
-            self.right[i] += pull * prior[i];
+            self.right[i] += pull * prior;
         }
         for i in 0..N {
             let pivot = (i..N)

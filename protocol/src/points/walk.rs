@@ -454,11 +454,11 @@ impl<'a> NewRows<'a> {
             }
         }
         if self.coding.rule() == Rule::Midpoint {
-            for u in 0..n {
+            for (u, guess) in guesses.iter_mut().enumerate() {
                 let at = v * (n + 1) + u;
                 let (a, b) = if (u + v).is_multiple_of(2) { (at, at + n + 2) } else { (at + 1, at + n + 1) };
                 if old[a] != NODATA && old[b] != NODATA {
-                    guesses[u] = ((old[a] + old[b] + 1) >> 1) - self.ground.base;
+                    *guess = ((old[a] + old[b] + 1) >> 1) - self.ground.base;
                 }
             }
         }

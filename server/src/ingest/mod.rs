@@ -326,11 +326,16 @@ fn check_grid(file: &Path, grid: &Grid) -> Result<()> {
 
 /// Opens one file, whatever its format.
 fn open_file(path: &Path, options: &Options, cache: &Arc<ChunkCache>, id: u32) -> Result<Raster> {
-    let file = File::open(path).map_err(io_error(path, "open it"))?;
-    let metadata = file.metadata().map_err(io_error(path, "ask for its length"))?;
+    // Before it is opened: opening a pipe would wait for somebody to write into it.
+    let metadata = path.metadata().map_err(io_error(path, "open it"))?;
     if metadata.is_dir() {
         return Err(unsupported(path, "a DEM file", "a directory", "name the files in it"));
     }
+    if !metadata.is_file() {
+        let remedy = "write what it holds into a file first, since windows of it are read";
+        return Err(unsupported(path, "a DEM file", "a pipe or device", remedy));
+    }
+    let file = File::open(path).map_err(io_error(path, "open it"))?;
     let name = path.file_name().and_then(|n| n.to_str()).unwrap_or_default().to_ascii_lowercase();
     let mut magic = [0; 2];
     let gzipped = file.read_exact_at(&mut magic, 0).is_ok() && magic == [0x1f, 0x8b];
