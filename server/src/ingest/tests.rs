@@ -531,6 +531,30 @@ fn nodata_becomes_nan_and_can_be_overridden() {
     assert_eq!(valid(&options), [false, true, false, false]);
 }
 
+/// A void of -32768 under another nodata value than the file's was a pit 33 km deep.
+#[test]
+fn a_void_that_nobody_declared_is_refused_and_nan_says_that_all_are_heights() {
+    let folder = folder();
+    let tags = Tags { nodata: Some("-9999"), ..Tags::utm() };
+    let samples = [263i16, 4370, -32768, -9999];
+    let path = put(&folder, "a.tif", &tiff!(colortype::GrayI16, 4, 1, samples, &tags));
+    let read = |nodata: Option<f64>| {
+        let options = Options { nodata, ..Options::default() };
+        let source = open(std::slice::from_ref(&path), &options).unwrap();
+        (whole_grid(&source), source.check_nodata())
+    };
+    let refusal = |checked: Result<()>| checked.unwrap_err().to_string();
+    let undeclared = refusal(read(None).1);
+    for word in ["a.tif", "263 to 4370", "found -32768", "--nodata -32768", "--nodata nan"] {
+        assert!(undeclared.contains(word), "{word}: {undeclared}");
+    }
+    // Another wrong value does not help.
+    assert!(refusal(read(Some(7.0)).1).contains("--nodata -"));
+    let (values, checked) = read(Some(f64::NAN));
+    assert_eq!(values, [263.0, 4370.0, -32768.0, -9999.0], "all are heights, the file's nodata too");
+    assert!(checked.is_ok());
+}
+
 #[test]
 fn a_mosaic_joins_exactly() {
     let folder = folder();
@@ -834,7 +858,13 @@ fn cases() -> Vec<Case> {
             Options { nodata: Some(-99_999.0), ..plain() },
             &["i16", "-99999", "--nodata"],
         ),
-        ("nodata NaN", "a.tif", small.clone(), Options { nodata: Some(f64::NAN), ..plain() }, &["NaN"]),
+        (
+            "nodata infinite",
+            "a.tif",
+            small.clone(),
+            Options { nodata: Some(f64::INFINITY), ..plain() },
+            &["i16", "inf", "--nodata"],
+        ),
         ("nodata unreadable", "a.tif", bad_nodata, plain(), &["'none'", "--nodata"]),
         ("no CRS", "a.asc", text(ASC), epsg(32632), &["EPSG:32632", "none in the file"]),
         ("no CRS, no place", "a.png", grey, epsg(32632), &["EPSG:32632", "none in the file"]),
