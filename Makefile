@@ -2,7 +2,7 @@
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .NOTPARALLEL:
-.PHONY: help demo test check bench setup fmt clippy tests doc deny wasm scripts
+.PHONY: help demo test check bench bench-peers setup fmt clippy tests doc deny wasm scripts
 
 # Mesa's device selection complains where there is no desktop session; there is nothing to select.
 export NODEVICE_SELECT := 1
@@ -15,6 +15,7 @@ help:
 	@echo "make test    everything that CI runs"
 	@echo "make check   formatting and lints only"
 	@echo "make bench   benchmarks, with a table at the end"
+	@echo "make bench-peers   bytes, bounds and speed beside other codecs, on the DEMs of DIAMANTINA_DATA"
 
 demo:
 	@$(step) setup scripts/setup demo
@@ -28,6 +29,13 @@ check: fmt clippy
 bench:
 	@$(step) setup scripts/setup demo
 	@scripts/bench
+	@echo "Beside other codecs: make bench-peers (first run: an hour and more)"
+
+bench-peers:
+	@$(step) setup scripts/setup demo
+	@$(step) build cargo build --locked --release -p diamantina-server -p diamantina-client
+	@$(step) peers scripts/bench-peers --speed --tins
+	@$(step) views scripts/bench-peers view
 
 setup:
 	@$(step) setup scripts/setup test
@@ -52,4 +60,4 @@ wasm:
 	@$(step) wasm scripts/wasm
 
 scripts:
-	@$(step) scripts shellcheck .ci/run scripts/bench scripts/deny scripts/setup scripts/step scripts/wasm
+	@$(step) scripts shellcheck .ci/run scripts/bench scripts/bench-peers scripts/deny scripts/setup scripts/step scripts/wasm

@@ -75,10 +75,11 @@ fn too_little_memory_is_refused_with_what_is_needed() {
     };
     let (code, message) = try_with("64MiB");
     assert_eq!(code, Some(2), "{message}");
-    let needed = message.trim_end().rsplit(' ').next().unwrap();
-    assert!(message.contains("--memory") && needed.parse::<u64>().is_ok(), "{message}");
-    // What the message asks for is enough, and a byte less is not.
+    assert!(message.contains("--memory 64MiB"), "{message}");
+    let needed = message.rsplit_once("--memory ").unwrap().1.split(' ').next().unwrap();
+    let mebibytes: u64 = needed.strip_suffix("MiB").unwrap().parse().unwrap();
+    // What the message asks for is enough, in its own words, and a unit less is not.
     let (code, message) = try_with(needed);
     assert_eq!(code, Some(0), "{message}");
-    assert_eq!(try_with(&(needed.parse::<u64>().unwrap() - 1).to_string()).0, Some(2));
+    assert_eq!(try_with(&format!("{}MiB", mebibytes - 1)).0, Some(2));
 }

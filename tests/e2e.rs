@@ -9,10 +9,14 @@
 
 /// The same input gives the same bytes, whatever the threads and the memory.
 mod determinism;
+/// Heights asked for: every sample, and places between.
+mod heights;
 /// Wrong uses, broken files and sudden ends, through the real programs: exit codes, words, what survives.
 mod hostile;
 /// What the server answers to whom: routes, caches, refusals, heights.
 mod http;
+/// Progressive streams: what any prefix is worth, who may ask for what, and the client that draws from one.
+mod progressive;
 /// Law 7: a build that was killed, stopped or ran out of disk goes on; the bytes are those of an unbroken one.
 mod resume;
 /// Law 2: any cut of a built store, with anything missing, has no cracks.

@@ -134,6 +134,18 @@ fn a_wrong_build_says_what_is_wrong_and_what_to_do() {
     std::fs::create_dir(file("folder")).unwrap();
     asc(&file("ten.asc"), 10.0, "5");
     asc(&file("twelve.asc"), 12.0, "5");
+    asc(&file("degrees.asc"), 0.001, "5");
+    let text = std::fs::read_to_string(file("degrees.asc")).unwrap();
+    std::fs::write(
+        file("degrees.asc"),
+        text.replace("xllcorner 0", "xllcorner 204.9").replace("yllcorner 0", "yllcorner 19.6"),
+    )
+    .unwrap();
+    // A void of another value than the one that the file declares.
+    let heights: Vec<String> =
+        (0..6400).map(|i| if i == 777 { -9999 } else { 100 + i % 53 }.to_string()).collect();
+    let head = "ncols 80\nnrows 80\nxllcorner 0\nyllcorner 0\ncellsize 10\nNODATA_value -1\n";
+    std::fs::write(file("void.asc"), format!("{head}{}\n", heights.join(" "))).unwrap();
     let mut png = png::Encoder::new(std::fs::File::create(file("picture.png")).unwrap(), 80, 80);
     png.set_color(png::ColorType::Grayscale);
     png.set_depth(png::BitDepth::Eight);
@@ -141,29 +153,53 @@ fn a_wrong_build_says_what_is_wrong_and_what_to_do() {
 
     for (args, code, wanted) in [
         // Broken files: the DEM is at fault.
-        ("{}/half.tif", 1, ["half.tif", "expected"].as_slice()),
-        ("{}/head.tif", 1, &["head.tif", "expected"]),
-        ("{}/wide.tif", 1, &["wide.tif", "expected"]),
-        ("{}/tall.tif", 1, &["tall.tif", "expected"]),
-        ("{}/none.tif", 1, &["none.tif", "expected"]),
+        ("{}/half.tif", 1, ["half.tif", "expected", "fetch"].as_slice()),
+        ("{}/head.tif", 1, &["head.tif", "expected", "fetch"]),
+        ("{}/wide.tif", 1, &["wide.tif", "a width from 1 to", "fetch"]),
+        ("{}/tall.tif", 1, &["tall.tif", "a height from 1 to", "fetch"]),
+        ("{}/none.tif", 1, &["none.tif", "a width from 1 to", "fetch"]),
         ("{}/empty.tif", 1, &["empty.tif", "an empty file", "fetch it again"]),
         ("{}/notes.txt", 1, &["notes.txt", "diary", "--raw"]),
         ("{}/folder", 1, &["folder", "a directory", "name the files in it"]),
+        ("/dev/null", 1, &["/dev/null", "a pipe or device", "into a file first"]),
         ("{}/nowhere.tif", 1, &["nowhere.tif", "check the path"]),
-        ("{}/short.raw --raw 100x100:f32 --cell 1", 1, &["short.raw", "expected"]),
+        (
+            "{}/short.raw --raw 100x100:f32 --cell 1",
+            1,
+            &["short.raw", "40000 bytes", "found 100 bytes", "correct the shape"],
+        ),
         // Files that do not fit the options.
         ("{}/ten.asc --nodata 5", 1, &["ten.asc", "all 6400 samples are nodata", "--nodata"]),
+        ("{}/void.asc", 2, &["void.asc", "100 to 152", "say --nodata -9999", "--nodata nan"]),
+        ("{}/void.asc --nodata 7", 2, &["void.asc", "say --nodata -9999"]),
+        ("{}/degrees.asc", 2, &["degrees.asc", "look like degrees", "--assume-crs EPSG:4326", "--cell"]),
+        ("{}/degrees.asc --crs source", 2, &["degrees.asc", "look like degrees", "--assume-crs EPSG:4326"]),
         ("{}/ten.asc --crs EPSG:32633", 2, &["ten.asc", "a source with a CRS", "leave --crs out"]),
         ("{}/good.tif --crs EPSG:64999", 2, &["good.tif", "EPSG:64999", "choose another code"]),
         ("{}/good.tif --crs EPSG:4326", 2, &["good.tif", "projected CRS"]),
         ("{}/picture.png", 2, &["picture.png", "--cell"]),
         ("{}/ten.asc {}/twelve.asc", 1, &["ten.asc", "twelve.asc", "cells of 12", "reproject or crop"]),
         ("{}/ten.asc {}/nowhere.asc", 1, &["nowhere.asc", "check the path"]),
-        ("{}/good.tif --memory 1MiB", 2, &["--memory", "needs at least"]),
+        ("{}/good.tif --memory 1MiB", 2, &["--memory 1MiB", "too little", "say --memory ", "MiB or more"]),
         ("{}/good.tif --max-error=-1", 2, &["--max-error -1", "expected 0"]),
         ("{}/good.tif --max-error nan", 2, &["--max-error NaN", "expected 0"]),
         ("{}/good.tif --max-error 1e30", 2, &["--max-error", "expected 0"]),
         ("{}/good.tif --quantum 0", 2, &["--quantum 0", "above 0"]),
+        ("{}/good.tif --quantum 1e300", 2, &["--quantum 1", "above 0 and below"]),
+        ("{}/good.tif --threads 0", 2, &["--threads", "1..=1024"]),
+        ("{}/good.tif --threads 100000", 2, &["--threads", "1..=1024"]),
+        (
+            "{}/good.tif --height-scale 1e300",
+            2,
+            &["good.tif", "a height scale from 1e-9", "correct the option"],
+        ),
+        (
+            "{}/good.tif --height-offset 1e300",
+            2,
+            &["good.tif", "a height offset below", "correct the option"],
+        ),
+        ("{}/picture.png --cell 1e300", 2, &["picture.png", "cells from 1e-6", "correct the option"]),
+        ("{}/picture.png --cell 1e-300", 2, &["picture.png", "cells from 1e-6", "correct the option"]),
         ("{}/good.tif --quantum nan", 2, &["--quantum NaN", "above 0"]),
         ("{}/good.tif --quantum 1e-9", 1, &["good.tif", "larger --quantum"]),
         // Wrong use: the command line itself makes no sense.
@@ -188,7 +224,111 @@ fn a_wrong_build_says_what_is_wrong_and_what_to_do() {
     assert_failed(&server(folder, "fly {}/good.tif"), 2, &["fly", "--help"], "unknown command");
     // An output that cannot be: below a file.
     let ended = server(folder, "build {}/good.tif -o {}/notes.txt/store");
-    assert_failed(&ended, 1, &["notes.txt/store", "cannot create"], "output below a file");
+    assert_failed(
+        &ended,
+        1,
+        &["notes.txt/store", "cannot create the folder", "choose another folder with -o"],
+        "output below a file",
+    );
+}
+
+/// `| head` made of a build that had succeeded one that had failed.
+#[test]
+fn a_reader_that_has_seen_enough_is_no_failure() {
+    let world = World::sample(257, 0.0);
+    let place = world.folder.path().display();
+    let url = world.served.scene("world");
+    let (server, client) = (programs().server.display(), programs().client.display());
+    for command in [
+        format!("{server} inspect {place}/store"),
+        format!("{server} inspect --json {place}/store"),
+        format!("{server} build {place}/dem.tif -o {place}/again"),
+        format!("{client} render {url} -o {place}/a.png --size 64x64"),
+        format!("{client} render {url} -o {place}/a.png --size 64x64 --json -"),
+    ] {
+        // The reader is gone before there is anything to read.
+        let script = format!("{command} | exec 0<&-; exit ${{PIPESTATUS[0]}}");
+        let mut bash = Command::new("bash");
+        bash.args(["-c", &script]).env("NODEVICE_SELECT", "1").stdin(Stdio::null());
+        let ended = end(bash.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap());
+        assert_eq!((ended.code, ended.err.as_str()), (Some(0), ""), "{command}");
+    }
+}
+
+/// One sample of 1e30 made all others of a float source the same height, without a word.
+#[test]
+fn nodata_that_nobody_declared_is_refused_with_the_remedy() {
+    let scratch = tempfile::tempdir().unwrap();
+    let folder = scratch.path();
+    for (name, wrong) in [("1e30", 1e30), ("3.4028235e38", f32::MAX), ("-3.4028235e38", f32::MIN)] {
+        for share in [1, 3000] {
+            let hills = |x: u32, y: u32| (f64::from(x) / 9.0).sin() * 70.0 + f64::from(y) / 7.0;
+            write_raw(&folder.join("dem.raw"), [200, 100], |x, y| {
+                Some(if y * 200 + x < share { wrong } else { hills(x, y) as f32 })
+            });
+            let build = "build {}/dem.raw --raw 200x100:f32 --cell 10 -o {}/store";
+            let ended = server(folder, build);
+            assert_failed(&ended, 1, &["dem.raw", "if it stands for nodata, say --nodata"], name);
+            let ended = server(folder, &format!("{build} --nodata={name}"));
+            assert_eq!(ended.code, Some(0), "{name}: {ended:?}");
+            assert!(ended.out.contains(" to 84.1"), "{ended:?}");
+        }
+    }
+}
+
+/// A build into a folder with other things in it left a store among them, hard to take out again.
+#[test]
+fn a_folder_with_foreign_files_is_no_place_for_a_store() {
+    let scratch = tempfile::tempdir().unwrap();
+    let folder = scratch.path();
+    sample::write(&folder.join("dem.tif"), 257).unwrap();
+    let build = "build {}/dem.tif -o {}/place --scene place";
+    let place = folder.join("place");
+    for name in ["holiday.jpg", "scene.json", "0123456789abcdef", ".hidden"] {
+        std::fs::create_dir(&place).unwrap();
+        std::fs::write(place.join(name), "{\"format\": \"three\"}").unwrap();
+        let wanted = ["place", "an empty folder or a store", name, "choose another folder with -o"];
+        assert_failed(&server(folder, build), 2, &wanted, name);
+        assert_eq!(files(&place).len(), 1, "{name}: something was written beside it");
+        std::fs::remove_dir_all(&place).unwrap();
+    }
+    // Nothing yet; an empty folder; the root of a file system; what a killed build leaves; a store; a store
+    // with a note in it; a store whose description is damaged: these are right.
+    let builds = |what: &str| {
+        let ended = server(folder, build);
+        assert_eq!(ended.code, Some(0), "{what}: {ended:?}");
+    };
+    builds("nothing yet");
+    std::fs::remove_dir_all(&place).unwrap();
+    std::fs::create_dir_all(place.join("lost+found")).unwrap();
+    builds("the root of a file system");
+    std::fs::remove_dir_all(&place).unwrap();
+    std::fs::create_dir_all(place.join(".building")).unwrap();
+    std::fs::create_dir_all(place.join("0123456789abcdef")).unwrap();
+    std::fs::write(place.join(".lock"), "").unwrap();
+    builds("a killed build");
+    std::fs::write(place.join("note.txt"), "ours").unwrap();
+    builds("a store with a note");
+    std::fs::remove_file(place.join("note.txt")).unwrap();
+    std::fs::write(place.join("scene.json"), "damaged").unwrap();
+    builds("a damaged description");
+    assert_eq!(server(folder, "inspect --verify {}/place").code, Some(0));
+}
+
+/// Names were cut at 64 characters, so that two folders could become one scene.
+#[test]
+fn a_folder_whose_name_is_too_long_for_a_scene_is_refused_with_the_remedy() {
+    let scratch = tempfile::tempdir().unwrap();
+    let folder = scratch.path();
+    sample::write(&folder.join("dem.tif"), 257).unwrap();
+    let long = "a".repeat(65);
+    let ended = server(folder, &format!("build {{}}/dem.tif -o {{}}/{long}"));
+    assert_failed(&ended, 2, &[&long, "at most 64 characters", "found 65", "--scene NAME"], "a long name");
+    assert!(!folder.join(&long).exists());
+    let ended = server(folder, &format!("build {{}}/dem.tif -o {{}}/{long} --scene short"));
+    assert_eq!(ended.code, Some(0), "{ended:?}");
+    let ended = server(folder, &format!("build {{}}/dem.tif -o {{}}/{}", &long[1..]));
+    assert_eq!(ended.code, Some(0), "{ended:?}");
 }
 
 #[test]
@@ -198,7 +338,7 @@ fn what_is_no_store_is_refused() {
     std::fs::create_dir(folder.join("bare")).unwrap();
     let scene = std::fs::read_to_string(folder.join("store/scene.json")).unwrap();
     std::fs::create_dir(folder.join("newer")).unwrap();
-    std::fs::write(folder.join("newer/scene.json"), scene.replacen("\"format\": 1", "\"format\": 2", 1))
+    std::fs::write(folder.join("newer/scene.json"), scene.replacen("\"format\": 2", "\"format\": 3", 1))
         .unwrap();
     std::fs::create_dir(folder.join("text")).unwrap();
     std::fs::write(folder.join("text/scene.json"), "not JSON").unwrap();
@@ -245,7 +385,7 @@ fn a_wrong_render_says_what_is_wrong_and_what_to_do() {
     let other = world.served.scene("mars");
     for (args, code, wanted) in [
         (format!("{dead} -o {{}}/a.png"), 1, ["is the server running"].as_slice()),
-        (format!("{other} -o {{}}/a.png"), 1, &["/scenes/mars", "404"]),
+        (format!("{other} -o {{}}/a.png"), 1, &["/scenes/mars", "404", "GET /scenes lists"]),
         (format!("{url} -o {{}}/file.txt/a.png --size 64x64"), 1, &["file.txt/a.png", "cannot write"]),
         (
             format!("{url} -o {{}}/a.png --size 64x64 --json {{}}/file.txt/a.json"),
@@ -309,11 +449,11 @@ fn a_flipped_bit_anywhere_is_found_and_its_file_named() {
             with_flip(path, byte as usize, bit, || {
                 let what = format!("bit {bit} of byte {byte} of {name}");
                 let named = if name == "scene.json" { "store" } else { name };
-                assert_failed(&server(folder, "inspect --verify {}/store"), 1, &[named], &what);
+                assert_failed(&server(folder, "inspect --verify {}/store"), 1, &[named, "again"], &what);
                 if !name.starts_with("pack-") {
-                    assert_failed(&server(folder, "inspect {}/store"), 1, &[named], &what);
+                    assert_failed(&server(folder, "inspect {}/store"), 1, &[named, "again"], &what);
                     let ended = server(folder, "serve {}/store --listen 127.0.0.1:0");
-                    assert_failed(&ended, 1, &[named], &what);
+                    assert_failed(&ended, 1, &[named, "again"], &what);
                 }
             });
         }

@@ -3,7 +3,9 @@
 use crate::world::{Dice, World, build, options, serve, write_raw};
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::{self, Entry};
-use diamantina_protocol::message::{self, BATCH_MAX, FrameHeader, HeightAnswer, Layer, Problem, Status};
+use diamantina_protocol::message::{
+    self, BATCH_MAX, FrameHeader, HeightAnswer, Layer, Problem, Status, StreamAsk,
+};
 use diamantina_server::projection::{self, Projection};
 use diamantina_server::store::Store;
 use diamantina_server::{ingest, inspect};
@@ -172,6 +174,21 @@ fn what_is_not_there_is_refused_in_words() {
             ("/scenes/world/0123456789abcdef/terrain/index/0".to_owned(), 410, v),
             ("/scenes/world/0123456789abcdef/terrain/points/1/1".to_owned(), 410, v),
             ("/scenes/world/0123456789abcdef/terrain/points?d=1,1".to_owned(), 410, v),
+            (format!("/scenes/world/{v}/water/stream"), 404, "layer"),
+            (format!("/scenes/world/{v}/terrain/stream?bbox=1,2,3"), 400, "x0,y0,x1,y1"),
+            (format!("/scenes/world/{v}/terrain/stream?bbox=3,0,1,9"), 400, "x0 <= x1"),
+            (format!("/scenes/world/{v}/terrain/stream?bbox=0,9,1,3"), 400, "y0 <= y1"),
+            (format!("/scenes/world/{v}/terrain/stream?bbox=0,NaN,1,3"), 400, "bbox=0,NaN,1,3"),
+            (format!("/scenes/world/{v}/terrain/stream?error=nan"), 400, "error=nan"),
+            (format!("/scenes/world/{v}/terrain/stream?error=-0.5"), 400, "0 or more"),
+            (format!("/scenes/world/{v}/terrain/stream?error=inf"), 400, "0 or more"),
+            (format!("/scenes/world/{v}/terrain/stream?error=1&error=2"), 400, "at most once"),
+            (format!("/scenes/world/{v}/terrain/stream?limit=0"), 400, "1 or more"),
+            (format!("/scenes/world/{v}/terrain/stream?eye=0,0,9"), 400, "angle="),
+            (format!("/scenes/world/{v}/terrain/stream?eye=0,0,9&angle=0"), 400, "above 0"),
+            (format!("/scenes/world/{v}/terrain/stream?eye=0,0,9&angle=1&sides=1,2"), 400, "x,y,z"),
+            (format!("/scenes/world/{v}/terrain/stream?tolerance=3"), 400, "no parameter"),
+            ("/scenes/world/0123456789abcdef/terrain/stream?error=1".to_owned(), 410, v),
             ("/scenes/world/terrain/height".to_owned(), 400, "lon"),
             ("/scenes/world/terrain/height?x=1".to_owned(), 400, "x"),
             ("/scenes/world/terrain/height?x=1&y=two".to_owned(), 400, "y"),
@@ -228,6 +245,59 @@ fn a_batch_comes_coarse_first_with_the_payloads_of_single_requests() {
         }
         assert!(rest.is_empty());
         assert_eq!((seen, missing), (centres.len(), 1));
+    });
+}
+
+#[test]
+fn a_stream_is_immutable_however_it_is_asked_for_and_holds_what_single_requests_do() {
+    let site = site();
+    block(async {
+        let route = |query: &str| site.url(&format!("/scenes/world/{}/terrain/stream?{query}", site.version));
+        let [x, y] = site.layer.origin;
+        let bbox = [x, y, x + 9000.0, y + 4000.0];
+        let ask = StreamAsk { error: 0.5, bbox: Some(bbox), ..StreamAsk::default() };
+        let answer = get(&site.url(&message::stream_route("world", &site.version, "terrain", &ask))).await;
+        assert_eq!((answer.status.as_u16(), answer.header(&CACHE_CONTROL)), (200, IMMUTABLE));
+        assert_eq!(answer.header(&CONTENT_TYPE), "application/octet-stream");
+        let tag = answer.header(&ETAG).to_owned();
+        // Another order of parameters, percent signs and more digits ask for the same.
+        let [x0, y0, x1, y1] = bbox;
+        let same = [
+            format!("bbox={x0:e},{y0},{x1:.3},{y1}&error=5e-1"),
+            format!("error=0.50&bbox={x0}%2C{y0}%2C{x1}%2C{y1}"),
+        ];
+        for same in &same {
+            let again = get(&route(same)).await;
+            assert_eq!((again.header(&ETAG), &again.body), (tag.as_str(), &answer.body), "{same}");
+            let known = self::ask(Method::GET, &route(same), &[(IF_NONE_MATCH, &tag)]).await;
+            assert_eq!((known.status.as_u16(), known.body.len()), (304, 0), "{same}");
+        }
+        assert_ne!(get(&route("error=6")).await.header(&ETAG), tag);
+        let head = self::ask(Method::HEAD, &route("error=5"), &[]).await;
+        assert_eq!((head.status.as_u16(), head.body.len()), (200, 0));
+        let (mut rest, mut seen, mut pages) = (answer.body.as_slice(), 0, 0);
+        while let Some((header, used)) = FrameHeader::read(rest).unwrap() {
+            let (blob, more) = rest[used..].split_at(header.length as usize);
+            rest = more;
+            assert_eq!(header.checksum, message::checksum(blob));
+            if header.status == Status::Page {
+                pages += 1;
+                let page = message::index_route("world", &site.version, "terrain", header.centre[0]);
+                assert_eq!(get(&site.url(&page)).await.body, blob);
+                continue;
+            }
+            assert_eq!(header.status, Status::Ok);
+            let d = site.layer.forest.diamond(header.centre).unwrap();
+            seen += 1;
+            if seen % 8 == 0 && !blob.is_empty() {
+                assert_eq!(get(&site.points(d)).await.body, blob);
+            }
+        }
+        println!("{} bytes: {seen} of {} diamonds, {pages} pages", answer.body.len(), site.diamonds.len());
+        assert!(rest.is_empty() && pages > 0 && seen > 10 && seen < site.diamonds.len());
+        let limited = get(&route(&format!("limit=20000&{}", same[0]))).await;
+        assert!(limited.body.len() >= 20_000 && answer.body.starts_with(&limited.body));
+        assert!(limited.body.len() < answer.body.len());
     });
 }
 

@@ -39,13 +39,13 @@ pub(crate) fn islands(x: u32, y: u32) -> Option<f32> {
 }
 
 /// A layer with all that its store has of it, decoded as the client decodes it.
-struct Loaded {
-    layer: Layer,
-    entries: HashMap<Diamond, Entry>,
-    surfaces: HashMap<Diamond, Arc<Surface>>,
+pub(crate) struct Loaded {
+    pub(crate) layer: Layer,
+    pub(crate) entries: HashMap<Diamond, Entry>,
+    pub(crate) surfaces: HashMap<Diamond, Arc<Surface>>,
 }
 
-fn load(store: &Store) -> Loaded {
+pub(crate) fn load(store: &Store) -> Loaded {
     let layer = store.scene().layers[0].clone();
     let entries = inspect::entries(store, 0, &layer).unwrap();
     let mut surfaces: HashMap<Diamond, Arc<Surface>> = HashMap::new();
@@ -102,7 +102,7 @@ fn edges(layer: &Layer, items: &[DrawItem]) -> (HashMap<Points, Vec<Vec<i32>>>, 
 
 /// Neighbours share every height of their edge; what has no neighbour lies on the forest's border, or has
 /// nothing beyond it, or (where `clipped`) may have a neighbour out of view. The number of shared edges.
-fn assert_no_cracks(layer: &Layer, items: &[DrawItem], clipped: bool) -> usize {
+pub(crate) fn assert_no_cracks(layer: &Layer, items: &[DrawItem], clipped: bool) -> usize {
     let [w, h] = layer.forest.size().map(i64::from);
     let mut shared = 0;
     for (points, heights) in edges(layer, items).0 {
@@ -150,6 +150,7 @@ fn any_cut_of_a_built_store_with_anything_missing_has_no_cracks() {
             let ask = Ask {
                 layer: &layer,
                 camera: &camera,
+                exaggeration: 1.0,
                 tolerance_pixels: 0.005 * 300f64.powf(dice.roll()),
                 splits_max: if round % 7 == 6 { 40 } else { usize::MAX },
             };

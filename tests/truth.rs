@@ -17,20 +17,21 @@ use diamantina_server::{hierarchy, ingest, inspect};
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::io::Write;
+use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
 /// Every sample of a source in metres above its height offset; NaN is nodata.
-struct Samples {
-    width: u32,
-    height: u32,
+pub(crate) struct Samples {
+    pub(crate) width: u32,
+    pub(crate) height: u32,
     metres: Vec<f64>,
 }
 
 impl Samples {
-    fn read(source: &Source) -> Self {
+    pub(crate) fn read(source: &Source) -> Self {
         let grid = source.grid();
         let bands: Vec<u32> = (0..grid.height).step_by(256).collect();
         let metres = bands
@@ -45,7 +46,7 @@ impl Samples {
     }
 
     /// The sample at a lattice point; nodata beyond the source.
-    fn at(&self, x: i64, y: i64) -> f64 {
+    pub(crate) fn at(&self, x: i64, y: i64) -> f64 {
         if x >= i64::from(self.width) || y >= i64::from(self.height) {
             return f64::NAN;
         }
@@ -55,10 +56,10 @@ impl Samples {
 
 /// What one run found.
 #[derive(Default)]
-struct Verdict {
-    compared: AtomicU64,
-    wrong: AtomicU64,
-    examples: Mutex<Vec<String>>,
+pub(crate) struct Verdict {
+    pub(crate) compared: AtomicU64,
+    pub(crate) wrong: AtomicU64,
+    pub(crate) examples: Mutex<Vec<String>>,
 }
 
 impl Verdict {
@@ -80,17 +81,17 @@ struct Corner {
 }
 
 /// A layer with the samples it was made of.
-struct Check<'a> {
-    layer: &'a Layer,
-    forest: Forest,
-    samples: &'a Samples,
-    entries: &'a HashMap<Diamond, Entry>,
-    verdict: &'a Verdict,
+pub(crate) struct Check<'a> {
+    pub(crate) layer: &'a Layer,
+    pub(crate) forest: Forest,
+    pub(crate) samples: &'a Samples,
+    pub(crate) entries: &'a HashMap<Diamond, Entry>,
+    pub(crate) verdict: &'a Verdict,
 }
 
 impl Check<'_> {
     /// All that the split of a diamond draws: up to four triangles of the next level.
-    fn split(&self, d: Diamond, block: &Block) {
+    pub(crate) fn split(&self, d: Diamond, block: &Block) {
         let local = self.forest.local(d);
         let n = self.forest.segments() as i64;
         let children = self.forest.children(d);
@@ -295,7 +296,10 @@ fn dems(folder: &Path) -> Vec<(PathBuf, ingest::Options)> {
         .filter(|fields| !fields[4].is_empty() && !fields[4].contains("x3"))
         .map(|fields| {
             let cell = fields[0].ends_with(".png").then_some(30.0);
-            let ingest = ingest::Options { crs: CrsChoice::Source, cell, ..ingest::Options::default() };
+            // Degrees, though the file does not say so.
+            let assume_crs = fields[0].contains("hilo").then(|| NonZeroU32::new(4326)).flatten();
+            let ingest =
+                ingest::Options { crs: CrsChoice::Source, cell, assume_crs, ..ingest::Options::default() };
             (folder.join(fields[0]), ingest)
         })
         .collect()

@@ -230,6 +230,8 @@ pub(crate) struct Faults {
     pub(crate) delay: Duration,
     /// How likely a connection is to be cut at some random byte.
     pub(crate) cut: f64,
+    /// Where the first connection is cut, which is left alone otherwise.
+    pub(crate) first_cut_at: Option<u64>,
     /// How likely a connection is to fall silent for `stall` at some random byte.
     pub(crate) stalled: f64,
     /// See `stalled`.
@@ -246,7 +248,7 @@ pub(crate) struct Proxy {
 
 impl Proxy {
     /// Starts a proxy, whose threads end with the process. The first connection, which reads the scene's
-    /// description, is left alone.
+    /// description, is left alone unless it is said where to cut it.
     pub(crate) fn start(upstream: &str, faults: Faults, seed: u64) -> Self {
         let upstream = upstream.strip_prefix("http://").unwrap().to_owned();
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -281,6 +283,7 @@ fn pump(
 ) {
     // Where in the connection's life something happens to it.
     let cut_at = (spoil && dice.roll() < faults.cut).then(|| dice.below(60_000));
+    let cut_at = if spoil { cut_at } else { faults.first_cut_at };
     let stall_at = (spoil && dice.roll() < faults.stalled).then(|| dice.below(60_000));
     let delay = faults.delay.mul_f64(dice.roll());
     let (mut sent, mut stalled) = (0, false);

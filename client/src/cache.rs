@@ -246,7 +246,13 @@ mod tests {
         let mut evicted = 0;
         for _ in 0..300 {
             let camera = any_camera(&mut dice);
-            let ask = Ask { layer: &built.layer, camera: &camera, tolerance_pixels: 0.5, splits_max: 225 };
+            let ask = Ask {
+                layer: &built.layer,
+                camera: &camera,
+                exaggeration: 1.0,
+                tolerance_pixels: 0.5,
+                splits_max: 225,
+            };
             let ideal = choose(&ask, |d| Some(built.entries[&d]));
             cache.want(ideal.splits().map(|d| (0, d)));
             let before = cache.len();

@@ -28,6 +28,13 @@ pub struct Camera {
 /// The vertical field of view of a camera that nobody said more of: 45 degrees.
 pub const FOV_Y: f64 = std::f64::consts::FRAC_PI_4;
 
+/// The nearest to the eye, in metres, that anything is drawn whose cells have these sides: as far as the near
+/// plane comes.
+#[must_use]
+pub fn nearest_drawn(cells: impl IntoIterator<Item = f64>) -> f64 {
+    cells.into_iter().fold(0.05, f64::min)
+}
+
 /// A half space: points with `normal . p + offset >= 0`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Plane {
@@ -51,6 +58,13 @@ impl Bounds {
     #[must_use]
     pub fn distance(&self, p: DVec3) -> f64 {
         (p.clamp(self.min, self.max) - p).length()
+    }
+
+    /// The box with its heights multiplied.
+    #[must_use]
+    pub fn stretched(&self, exaggeration: f64) -> Self {
+        let by = DVec3::new(1.0, 1.0, exaggeration);
+        Self { min: self.min * by, max: self.max * by }
     }
 
     /// Whether any of the box may lie inside all planes.

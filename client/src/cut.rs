@@ -12,7 +12,7 @@
 //! Pure functions: no clock, no network, no memory from frame to frame. The order of refinement is that of
 //! Duchaineau et al., *ROAMing Terrain* (1997), the forced parents likewise.
 
-use crate::camera::{Bounds, Camera, Plane};
+use crate::camera::{Bounds, Camera, Plane, nearest_drawn};
 use crate::drawing::DrawItem;
 use crate::surface::Surface;
 use diamantina_protocol::bintree::Forest;
@@ -35,10 +35,27 @@ pub struct Ask<'a> {
     pub layer: &'a Layer,
     /// The view.
     pub camera: &'a Camera,
+    /// What heights are multiplied by; those of the camera are already.
+    pub exaggeration: f64,
     /// The error to reach, in pixels.
     pub tolerance_pixels: f64,
     /// Diamonds that may be split; the roots are, in any case.
     pub splits_max: usize,
+}
+
+impl Ask<'_> {
+    /// The box of a diamond as it is drawn.
+    fn bounds(&self, d: Diamond, entry: &Entry) -> Bounds {
+        bounds(self.layer, d, entry).stretched(self.exaggeration)
+    }
+
+    /// The largest apparent size, in pixels, of an error anywhere in a box. Finite, even if the eye is in the
+    /// box: nothing nearer than the near plane is drawn.
+    fn pixels(&self, error_metres: f32, bounds: &Bounds) -> f64 {
+        let distance = bounds.distance(self.camera.eye).max(nearest_drawn(self.layer.cell));
+        // Heights pressed together leave the errors of outlines as they are.
+        self.exaggeration.max(1.0) * self.camera.error_pixels(error_metres, distance)
+    }
 }
 
 /// The set of diamonds that should be split, from the index alone.
@@ -322,13 +339,11 @@ impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
         let found = (self.entry)(d);
         let known = found.is_some();
         let entry = found.or(parent).unwrap_or_else(|| unknown(self.ask.layer));
-        let bounds = bounds(self.ask.layer, d, &entry);
+        let bounds = self.ask.bounds(d, &entry);
         let in_view = !entry.is_empty() && bounds.touches(&self.planes);
-        let camera = self.ask.camera;
-        let pixels =
-            if in_view { camera.error_pixels(entry.error_metres, bounds.distance(camera.eye)) } else { 0.0 };
+        let pixels = if in_view { self.ask.pixels(entry.error_metres, &bounds) } else { 0.0 };
         // Beyond the picture's height, more error is no worse.
-        let priority = pixels.min(f64::from(camera.size[1]));
+        let priority = pixels.min(f64::from(self.ask.camera.size[1]));
         let number = u32::try_from(self.ideal.nodes.len()).unwrap_or(NONE);
         self.ideal.numbers.insert(d, number);
         self.ideal.nodes.push(Node {
@@ -370,8 +385,7 @@ impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
         }
         let finest = diamond.level() + 1 == self.forest.levels() && in_view;
         self.ideal.finest_pixels.push(if finest {
-            let distance = bounds(self.ask.layer, diamond, &entry).distance(self.ask.camera.eye);
-            self.ask.camera.error_pixels(self.ask.layer.finest_error, distance)
+            self.ask.pixels(self.ask.layer.finest_error, &self.ask.bounds(diamond, &entry))
         } else {
             0.0
         });
@@ -455,7 +469,7 @@ mod tests {
     type Side = Vec<([i64; 2], i32)>;
 
     fn ask<'a>(built: &'a Built, camera: &'a Camera, tolerance_pixels: f64) -> Ask<'a> {
-        Ask { layer: &built.layer, camera, tolerance_pixels, splits_max: usize::MAX }
+        Ask { layer: &built.layer, camera, exaggeration: 1.0, tolerance_pixels, splits_max: usize::MAX }
     }
 
     /// The three sides of a drawn triangle: n+1 lattice points with their heights, from the lesser end.
@@ -611,6 +625,50 @@ mod tests {
                 assert!(forest.parents(*d).all(|p| order[..at].contains(&p)), "parents are asked for first");
             }
         }
+    }
+
+    #[test]
+    fn heights_multiplied_are_cut_as_a_terrain_of_that_height() {
+        let mut dice = Dice(77);
+        let built = &world()[0];
+        for round in 0..40 {
+            let exaggeration = [1.5, 5.0, 40.0][round % 3];
+            let tall = Layer {
+                quantum: built.layer.quantum * exaggeration,
+                height_offset: built.layer.height_offset * exaggeration,
+                finest_error: built.layer.finest_error * exaggeration as f32,
+                ..built.layer.clone()
+            };
+            let taller = |e: Entry| Entry { error_metres: e.error_metres * exaggeration as f32, ..e };
+            // Every third one looks straight down, where multiplied heights are multiplied distances, too.
+            let camera = any_camera(&mut dice);
+            let eye = camera.eye.with_z(camera.eye.z * exaggeration);
+            let target = if round % 3 == 0 { eye - DVec3::Z } else { camera.target };
+            let camera = Camera { eye, target, ..camera };
+            let ask = Ask { exaggeration, ..ask(built, &camera, 2.0) };
+            let ideal = choose(&ask, |d| Some(built.entries[&d]));
+            let as_tall = Ask { layer: &tall, exaggeration: 1.0, ..ask };
+            let expected = choose(&as_tall, |d| Some(taller(built.entries[&d])));
+            let count = |a: &Ideal| a.splits().collect::<HashSet<_>>();
+            let different = count(&ideal).symmetric_difference(&count(&expected)).count();
+            // Errors are f32, so one that is just at the tolerance may fall on either side.
+            assert!(different * 200 <= expected.len().max(200), "{different} of {}", expected.len());
+        }
+    }
+
+    #[test]
+    fn an_eye_within_the_terrain_sees_an_error_of_finite_size() {
+        let built = &world()[0];
+        let lossy = Layer { finest_error: 1.5, ..built.layer.clone() };
+        let [low, high] = built.layer.forest.bounds(built.layer.forest.root_diamonds().next().unwrap());
+        let [x, y] = built.layer.position([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2]);
+        let eye = DVec3::new(x, y, f64::midpoint(built.layer.heights[0], built.layer.heights[1]));
+        let camera = Camera { eye, target: eye + DVec3::X, ..above() };
+        let ask = Ask { layer: &lossy, ..ask(built, &camera, 1.0) };
+        let ideal = choose(&ask, |d| Some(built.entries[&d]));
+        let goal = draw(0, &ask, &ideal, |_| None).error_pixels_goal;
+        let nearest = camera.error_pixels(1.5, 0.05);
+        assert!(goal > camera.error_pixels(1.5, 1000.0) && goal <= nearest * (1.0 + 1e-6), "{goal}");
     }
 
     #[test]

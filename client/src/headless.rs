@@ -30,7 +30,11 @@ pub enum HeadlessError {
     #[error(transparent)]
     Render(#[from] RenderError),
     /// A file cannot be written or read.
-    #[error("{path}: cannot {action}: {error}")]
+    #[error("{path}: cannot {action}: {error}; {}", match error.kind() {
+        std::io::ErrorKind::StorageFull | std::io::ErrorKind::QuotaExceeded => "free some space",
+        std::io::ErrorKind::NotFound => "does its folder exist?",
+        _ => "choose another path",
+    })]
     File {
         /// What was being done.
         action: &'static str,
@@ -87,11 +91,25 @@ fn around_box([low, high]: [DVec3; 2], size: [u32; 2], exaggeration: f64) -> Cam
     around(&(0..8).map(corner).collect::<Vec<_>>(), size, exaggeration)
 }
 
+/// Begins to stream what a picture from `camera` needs, in one request; [`picture`] (or [`framed`]) goes on from
+/// there. The camera's heights are stretched as there.
+pub fn stream(terrain: &mut Terrain, camera: &Camera, exaggeration: f64) {
+    terrain.set_exaggeration(exaggeration);
+    terrain.stream(&stretched(camera, exaggeration));
+}
+
+/// As [`overview`], of a scene whose heights are multiplied by `exaggeration` (but the camera's are not).
+#[must_use]
+pub fn stretched_overview(scene: &Scene, size: [u32; 2], exaggeration: f64) -> Camera {
+    around_box(extent(scene), size, exaggeration)
+}
+
 /// As [`overview`], but as near as the terrain itself allows, which may be less than its box: waits for a
 /// coarse form of it. Heights are multiplied by `exaggeration` to find the camera, but its own are not.
 pub fn framed(terrain: &mut Terrain, size: [u32; 2], exaggeration: f64, patience: Duration) -> Camera {
-    let camera = around_box(extent(terrain.scene()), size, exaggeration);
-    let wide = unstretched(&stretched(&camera, exaggeration), exaggeration);
+    let camera = stretched_overview(terrain.scene(), size, exaggeration);
+    let wide = stretched(&camera, exaggeration);
+    terrain.set_exaggeration(exaggeration);
     let until = Instant::now() + patience;
     let view = loop {
         let view = terrain.frame(&wide);
@@ -186,48 +204,6 @@ fn stretched(camera: &Camera, exaggeration: f64) -> Camera {
     Camera { eye: stretch(camera.eye), target: stretch(camera.target), ..*camera }
 }
 
-/// A camera that sees, of the terrain as it is, at least what `camera` sees of the stretched one, and sees a
-/// metre as large at each distance. Distances only shrink on the way (or, where exaggeration is below 1, by
-/// no more than heights do), so a cut whose error is E pixels in this view has at most E times the larger of
-/// exaggeration and 1 in the stretched one.
-fn unstretched(camera: &Camera, exaggeration: f64) -> Camera {
-    let flat = |p: DVec3| p.with_z(p.z / exaggeration);
-    let eye = flat(camera.eye);
-    #[allow(clippy::float_cmp, reason = "1 is what no option leaves")]
-    if exaggeration == 1.0 {
-        return *camera;
-    }
-    let [right, up, backward] = camera.axes();
-    let half = camera.size.map(|s| f64::from(s) / 2.0 / camera.pixels_per_radian());
-    let corners = [[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]];
-    let corners =
-        corners.map(|[x, y]| flat(right * (x * half[0]) + up * (y * half[1]) - backward).normalize());
-    // Half way between the upper and the lower side, so that no corner is a right angle away.
-    let [lower, upper] = [corners[0] + corners[1], corners[2] + corners[3]].map(DVec3::normalize);
-    let view = Camera { eye, target: eye + (lower + upper).normalize(), ..*camera };
-    let [right, up, backward] = view.axes();
-    let size = [right, up].map(|axis| {
-        let tan = |c: &DVec3| c.dot(axis).abs() / c.dot(-backward).max(1e-6);
-        let most = corners.iter().map(tan).fold(0.0, f64::max);
-        #[allow(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            reason = "a float to integer cast saturates"
-        )]
-        let pixels = (2.0 * most * camera.pixels_per_radian()).ceil() as u32;
-        pixels.max(1)
-    });
-    let fov_y = 2.0 * (f64::from(size[1]) / 2.0 / camera.pixels_per_radian()).atan();
-    Camera { fov_y, size, ..view }
-}
-
-/// The tolerance to stream with, in pixels, so that heights multiplied by `exaggeration` are drawn with one
-/// of `pixels`.
-#[must_use]
-pub fn tolerance(pixels: f64, exaggeration: f64) -> f64 {
-    pixels / exaggeration.max(1.0)
-}
-
 /// Numbers about a picture.
 #[derive(Debug, Clone, Serialize)]
 pub struct PictureReport {
@@ -267,7 +243,9 @@ pub struct PictureReport {
     pub exaggeration: f64,
     /// The asked error, in pixels.
     pub asked_error_pixels: f64,
-    /// The largest error of what is drawn, in pixels, from the declared errors.
+    /// The largest error of what is drawn, in pixels, from the declared errors: the apparent size of the error
+    /// at the point of its box that is nearest to the eye, though no nearer than the near plane. `null` in
+    /// JSON if too little arrived to draw anything.
     pub largest_error_pixels: f64,
     /// Whether all that was wanted arrived.
     pub complete: bool,
@@ -289,7 +267,8 @@ pub fn picture(
 ) -> Result<(Picture, PictureReport), HeadlessError> {
     let mut offscreen = Offscreen::new(options)?;
     let drawn = stretched(camera, look.exaggeration);
-    let view = terrain.settle(&unstretched(&drawn, look.exaggeration), patience);
+    terrain.set_exaggeration(look.exaggeration);
+    let view = terrain.settle(&drawn, patience);
     let layers = &terrain.scene().layers;
     offscreen.draw(layers, &drawn, &view.items, look)?;
     offscreen.read()?;
@@ -311,7 +290,6 @@ fn report(
     milliseconds_a_frame: f64,
 ) -> PictureReport {
     let Stats { traffic, .. } = view.stats;
-    let larger = look.exaggeration.max(1.0);
     PictureReport {
         scene: terrain.scene().name.clone(),
         version: terrain.scene().version.clone(),
@@ -330,21 +308,38 @@ fn report(
         seconds_to_first_picture: view.stats.first_picture_seconds,
         seconds_to_asked_error: view.stats.asked_error_seconds,
         exaggeration: look.exaggeration,
-        asked_error_pixels: terrain.tolerance_pixels() * larger,
-        largest_error_pixels: view.error_pixels * larger,
+        asked_error_pixels: terrain.tolerance_pixels(),
+        largest_error_pixels: view.error_pixels,
         complete: view.complete,
         milliseconds_a_frame,
     }
 }
 
-/// Writes a picture as PNG.
+/// Writes a picture as PNG: whole, or not at all. What is at `path` stays until it can be replaced.
 ///
 /// # Errors
 /// When the file cannot be written.
 pub fn save(picture: &Picture, path: &Path) -> Result<(), HeadlessError> {
     let failed = file_error("write the picture", path);
-    let file = File::create(path).map_err(&failed)?;
-    write_png(picture, BufWriter::new(file)).map_err(|e| failed(std::io::Error::other(e)))
+    if path.exists() && !path.is_file() {
+        // A device or a pipe takes bytes as they come.
+        return write(picture, path).map_err(failed);
+    }
+    let mut aside = path.as_os_str().to_owned();
+    aside.push(".part");
+    let aside = Path::new(&aside);
+    let moved = write(picture, aside).and_then(|()| std::fs::rename(aside, path));
+    if moved.is_err() {
+        // It is of no use to anybody; the error says why.
+        let _ = std::fs::remove_file(aside);
+    }
+    moved.map_err(failed)
+}
+
+fn write(picture: &Picture, path: &Path) -> std::io::Result<()> {
+    let mut out = BufWriter::new(File::create(path)?);
+    write_png(picture, &mut out).map_err(std::io::Error::other)?;
+    out.flush()
 }
 
 /// A path through a scene: eyes and targets at moments.
@@ -473,7 +468,7 @@ pub struct FrameLine {
     pub cut_ms: f64,
     /// Milliseconds to upload and draw, until the picture is there.
     pub draw_ms: f64,
-    /// The largest error of what is drawn, in pixels.
+    /// The largest error of what is drawn, in pixels, as in [`PictureReport`]; `inf` until all roots are there.
     pub error_pixels: f64,
     /// The error of the ideal cut.
     pub goal_pixels: f64,
@@ -552,6 +547,7 @@ pub fn fly(
 ) -> Result<(), HeadlessError> {
     let mut offscreen = Offscreen::new(options)?;
     let layers = terrain.scene().layers.clone();
+    terrain.set_exaggeration(look.exaggeration);
     let started = Instant::now();
     for frame in 0..flight.frames {
         if flight.frames_a_second > 0.0 {
@@ -561,7 +557,7 @@ pub fn fly(
         let camera = path.camera(f64::from(frame) / f64::from((flight.frames - 1).max(1)), flight.size);
         let clock = Instant::now();
         let drawn = stretched(&camera, look.exaggeration);
-        let view = terrain.frame(&unstretched(&drawn, look.exaggeration));
+        let view = terrain.frame(&drawn);
         let cut_ms = clock.elapsed().as_secs_f64() * 1e3;
         let clock = Instant::now();
         let stats = offscreen.draw(&layers, &drawn, &view.items, look)?;
@@ -572,8 +568,8 @@ pub fn fly(
             seconds: started.elapsed().as_secs_f64(),
             cut_ms,
             draw_ms,
-            error_pixels: view.error_pixels * look.exaggeration.max(1.0),
-            goal_pixels: view.error_pixels_goal * look.exaggeration.max(1.0),
+            error_pixels: view.error_pixels,
+            goal_pixels: view.error_pixels_goal,
             complete: view.complete,
             diamonds: view.items.len(),
             triangles: stats.triangles,
@@ -630,6 +626,21 @@ mod tests {
     }
 
     #[test]
+    fn a_picture_is_written_whole_or_not_at_all() {
+        let folder = tempfile::tempdir().unwrap();
+        let picture = Picture { size: [64, 64], pixels: (0..=255).cycle().take(4 * 64 * 64).collect() };
+        let path = folder.path().join("a.png");
+        save(&picture, &path).unwrap();
+        let before = std::fs::read(&path).unwrap();
+        // A folder in the way of what is written aside.
+        std::fs::create_dir(folder.path().join("a.png.part")).unwrap();
+        assert!(save(&Picture { size: [1, 1], pixels: vec![9; 4] }, &path).is_err());
+        assert_eq!(std::fs::read(&path).unwrap(), before, "the old one stays");
+        let full = save(&picture, Path::new("/dev/full")).unwrap_err().to_string();
+        assert!(full.contains("/dev/full") && full.contains("write the picture"), "{full}");
+    }
+
+    #[test]
     fn an_overview_holds_the_box_tightly() {
         let boxes = [
             [DVec3::new(5e5, 4e6, 0.0), DVec3::new(5.6e5, 4.06e6, 3500.0)],
@@ -655,33 +666,6 @@ mod tests {
     fn a_lone_point_has_an_overview() {
         let camera = around(&[DVec3::new(5e5, 4e6, 100.0)], [4, 3], 1.0);
         assert!(camera.eye.is_finite() && camera.eye != camera.target, "{camera:?}");
-    }
-
-    #[test]
-    fn an_unstretched_view_holds_what_the_stretched_one_shows() {
-        let mut state = 1u64;
-        let mut dice = || {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (state >> 33) as f64 / f64::from(1u32 << 31)
-        };
-        for _ in 0..2000 {
-            let exaggeration = *[0.3, 2.0, 5.0, 20.0].iter().find(|_| dice() < 0.3).unwrap_or(&1.0);
-            let mut point = |z: f64| DVec3::new(dice() * 1e4, dice() * 1e4, dice() * z);
-            let camera = Camera { eye: point(2e4), target: point(1e3), fov_y: FOV_Y, size: [1380, 768] };
-            let p = point(1e3 * exaggeration);
-            let wide = unstretched(&camera, exaggeration);
-            assert!((wide.pixels_per_radian() / camera.pixels_per_radian() - 1.0).abs() < 1e-9);
-            let flat = p.with_z(p.z / exaggeration);
-            let [x, y, depth] = seen(&camera, p);
-            if depth > 0.0 && x.abs() < 1.0 && y.abs() < 1.0 {
-                let [x, y, depth] = seen(&wide, flat);
-                assert!(depth > 0.0 && x.abs() < 1.0 + 1e-6 && y.abs() < 1.0 + 1e-6, "{camera:?} {wide:?}");
-            }
-            // An error of a metre, stretched, at its own distance.
-            let (near, far) = ((flat - wide.eye).length(), (p - camera.eye).length());
-            let bound = wide.error_pixels(1.0, near) * exaggeration.max(1.0);
-            assert!(camera.error_pixels(1.0, far) * exaggeration <= bound * (1.0 + 1e-6));
-        }
     }
 
     #[test]

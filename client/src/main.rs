@@ -8,7 +8,7 @@ use diamantina_client::render::{self, Background, Colours, Look, Sun};
 use diamantina_client::terrain::{self, Terrain, TerrainError};
 use diamantina_protocol::message::Scene;
 use glam::DVec3;
-use std::io::Write;
+use std::io::{IsTerminal, Write};
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -99,6 +99,11 @@ struct RenderArgs {
     /// A point in the middle of the picture, in the frame's metres
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, requires = "eye", allow_hyphen_values = true)]
     target: Option<DVec3>,
+    /// Ask for the whole view in one request, the largest errors first: one round trip after the scene's
+    /// description. Without --eye it is asked for as seen from a little farther away than it is then drawn, and
+    /// more requests follow
+    #[arg(long)]
+    stream: bool,
     /// Seconds to wait for data before drawing what is there
     #[arg(long, default_value_t = 60.0, value_name = "SECONDS")]
     timeout: f64,
@@ -182,10 +187,21 @@ impl<E: std::error::Error> From<E> for Failure {
     }
 }
 
+/// What became of printing results. That nobody reads any more, as behind `| head`, is no failure.
+fn shown(printed: std::io::Result<()>) -> std::io::Result<()> {
+    match printed {
+        Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        other => other,
+    }
+}
+
 fn main() -> ExitCode {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| "warn,wgpu_hal=error,wgpu_core=error".into());
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    let colours =
+        std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty());
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours);
+    log.with_writer(std::io::stderr).init();
     let result = match Cli::parse().command {
         Command::Render(args) => render(&args),
         Command::Fly(args) => fly(&args),
@@ -219,7 +235,7 @@ impl ViewArgs {
             Encoding::Points => terrain::ENCODING.to_owned(),
         };
         let options = terrain::Options {
-            tolerance_pixels: headless::tolerance(self.error_pixels, self.exaggeration),
+            tolerance_pixels: self.error_pixels,
             memory_bytes: self.memory << 20,
             encoding,
             ..terrain::Options::default()
@@ -259,6 +275,7 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
     let patience = Duration::try_from_secs_f64(args.timeout)
         .map_err(|_| Failure(2, format!("--timeout {}: expected seconds, 0 or more", args.timeout)))?;
     let mut terrain = args.view.open()?;
+    let ViewArgs { size, exaggeration, .. } = args.view;
     let camera = match (args.eye, args.target) {
         (Some(eye), Some(target)) if eye == target => {
             return Err(Failure(
@@ -266,19 +283,31 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
                 "--eye and --target are the same point: there is no direction to look in".to_owned(),
             ));
         }
-        (Some(eye), Some(target)) => Camera { eye, target, fov_y: FOV_Y, size: args.view.size },
-        _ => headless::framed(&mut terrain, args.view.size, args.view.exaggeration, patience),
+        (Some(eye), Some(target)) => {
+            let camera = Camera { eye, target, fov_y: FOV_Y, size };
+            if args.stream {
+                headless::stream(&mut terrain, &camera, exaggeration);
+            }
+            camera
+        }
+        _ => {
+            if args.stream {
+                let wide = headless::stretched_overview(terrain.scene(), size, exaggeration);
+                headless::stream(&mut terrain, &wide, exaggeration);
+            }
+            headless::framed(&mut terrain, size, exaggeration, patience)
+        }
     };
     let look = args.view.look(terrain.scene());
     let (picture, report) = headless::picture(&mut terrain, &camera, &look, &args.view.options(), patience)?;
     headless::save(&picture, &args.output)?;
     if let Some(path) = &args.json {
         let mut out = headless::open_text(path)?;
-        writeln!(out, "{}", serde_json::to_string_pretty(&report)?)?;
-        out.flush()?;
+        let printed = writeln!(out, "{}", serde_json::to_string_pretty(&report)?);
+        shown(printed.and_then(|()| out.flush()))?;
     }
     if args.json.as_ref().is_none_or(|p| p.as_os_str() != "-") {
-        print_report(args, &report)?;
+        shown(print_report(args, &report))?;
     }
     if report.complete {
         return Ok(());
@@ -328,7 +357,15 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
         writeln!(out, "{}", FrameLine::HEADING)?;
     }
     if let Some(folder) = &args.pictures {
-        std::fs::create_dir_all(folder).map_err(|e| Failure(1, format!("{}: {e}", folder.display())))?;
+        std::fs::create_dir_all(folder).map_err(|e| {
+            Failure(
+                1,
+                format!(
+                    "{}: cannot create the folder: {e}; choose another with --pictures",
+                    folder.display()
+                ),
+            )
+        })?;
     }
     let flight = Flight {
         frames: args.frames,
@@ -357,7 +394,7 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
         out.flush()?;
     }
     if let Some(error) = failed {
-        return Err(error.into());
+        return Ok(shown(Err(error))?);
     }
     if let Some(last) = last.filter(|_| args.csv.as_ref().is_none_or(|p| p.as_os_str() != "-")) {
         let mut out = std::io::stdout().lock();

@@ -13,16 +13,17 @@
 //! themselves, so a whole branch that arrived in one answer is decoded between two frames.
 
 use crate::cache::{Cache, Index, Key, PAGES_MAX};
-use crate::camera::Camera;
+use crate::camera::{Camera, Plane};
 use crate::cut::{self, Ask, Ideal, Wish};
 use crate::drawing::DrawItem;
 use crate::fetch::{self, Event, FetchError, Fetcher, ROOT_BYTES, Traffic, Want};
 use crate::surface::Surface;
 use bytes::Bytes;
 use diamantina_protocol::diamond::Diamond;
-use diamantina_protocol::message::{Layer, Scene};
+use diamantina_protocol::message::{Layer, Scene, StreamAsk, StreamView};
 use diamantina_protocol::points::DecodeError;
 use foldhash::fast::RandomState;
+use glam::DVec3;
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
@@ -33,6 +34,13 @@ const HELD_BYTES_MAX: usize = 16 << 20;
 
 /// Wishes that are made however much is held: payloads may be waiting for these.
 const WISHES_MIN: usize = 64;
+
+/// What a frame takes in however much is held: the parents of what is held may be among it.
+const EVENTS_MIN: usize = 64;
+
+/// Payloads of a stream that come one after another and are not wanted, until it is dropped: the eye has moved
+/// away, or there is no memory for more.
+const STRAYS_MAX: usize = 256;
 
 /// Decoded surfaces that wait for a frame to take them: 25 MB for n = 64. The decoders pause there.
 const DONE_MAX: usize = 256;
@@ -45,6 +53,8 @@ pub const ENCODING: &str = "points";
 pub struct Options {
     /// The error to reach, in pixels.
     pub tolerance_pixels: f64,
+    /// What heights are multiplied by, and errors with them.
+    pub exaggeration: f64,
     /// Memory for surfaces, in bytes. What the cut wants takes at most three quarters of it: where that is
     /// too little for the tolerance, the largest errors are reduced first.
     pub memory_bytes: usize,
@@ -58,6 +68,7 @@ impl Default for Options {
     fn default() -> Self {
         Self {
             tolerance_pixels: 1.0,
+            exaggeration: 1.0,
             memory_bytes: 512 << 20,
             encoding: ENCODING.to_owned(),
             fetch: fetch::Options::default(),
@@ -88,7 +99,9 @@ pub enum TerrainError {
     #[error("tolerance of {0} pixels: expected a number above 0")]
     Tolerance(f64),
     /// No threads.
-    #[error("cannot start a decoding thread: {0}")]
+    #[error(
+        "cannot start a decoding thread: {0}: close other programs, or raise the limit on threads (ulimit -u)"
+    )]
     Thread(#[from] std::io::Error),
 }
 
@@ -131,7 +144,8 @@ pub struct FrameView {
     /// The triangles to draw; together they cover whatever of the scene is in view, once all roots are
     /// there.
     pub items: Vec<DrawItem>,
-    /// The largest declared error of what is drawn, in pixels; infinite while a layer lacks a root.
+    /// The largest declared error of what is drawn, in pixels, as it looks from no nearer than the near plane;
+    /// infinite while a layer lacks a root.
     pub error_pixels: f64,
     /// The same, once all that the ideal cut wants has arrived, as far as the index tells already.
     pub error_pixels_goal: f64,
@@ -156,6 +170,8 @@ pub struct Terrain {
     /// Payloads handed to the decoders, with their bytes, and the sum.
     pending: HashMap<Key, usize, RandomState>,
     pending_bytes: usize,
+    /// Unwanted payloads of streams in a row.
+    strays: usize,
     failed: HashSet<fetch::Key, RandomState>,
     problem: Option<String>,
     scene_changed: bool,
@@ -210,6 +226,7 @@ impl Terrain {
             options,
             pending: HashMap::default(),
             pending_bytes: 0,
+            strays: 0,
             failed: HashSet::default(),
             problem: None,
             scene_changed: false,
@@ -250,12 +267,39 @@ impl Terrain {
         }
     }
 
-    /// Takes in what has arrived, says what to draw, and asks for what is missing. Never waits; takes
-    /// about a microsecond for each diamond that the cut looks at.
+    /// Sets what heights are multiplied by; what is no number above 0 changes nothing.
+    pub fn set_exaggeration(&mut self, exaggeration: f64) {
+        if exaggeration > 0.0 && exaggeration.is_finite() {
+            self.options.exaggeration = exaggeration;
+        }
+    }
+
+    /// Asks for all that a view needs in one request a layer, the largest errors first: on the way, each frame
+    /// draws what is there, and once it has ended, frames ask for what is still missing. It is dropped where
+    /// most of it turns out not to be wanted. The camera is as for [`Terrain::frame`].
+    pub fn stream(&mut self, camera: &Camera) {
+        // A little less than the tolerance, for the rounding of both ends.
+        let angle = self.options.tolerance_pixels / camera.pixels_per_radian() * (1.0 - 1e-9);
+        // The server knows heights as they are: the same view, from where a camera of such heights would be.
+        // Where heights are exaggerated it asks for no more than the cut wants, which asks for the rest.
+        let exaggeration = self.options.exaggeration;
+        let flat = |plane: &Plane| (plane.normal * DVec3::new(1.0, 1.0, exaggeration)).normalize().to_array();
+        let sides = camera.planes().iter().map(flat).collect();
+        let eye = camera.eye.with_z(camera.eye.z / exaggeration).to_array();
+        let view = StreamView { eye, angle, sides };
+        for layer in 0..self.layers.len() {
+            self.fetcher.stream(layer, StreamAsk { view: Some(view.clone()), ..StreamAsk::default() });
+        }
+        self.strays = 0;
+    }
+
+    /// Takes in what has arrived, says what to draw, and asks for what is missing. The camera's heights are
+    /// multiplied, if those of the terrain are. Never waits; takes about a microsecond for each diamond that
+    /// the cut looks at.
     pub fn frame(&mut self, camera: &Camera) -> FrameView {
         let started = Instant::now();
         self.take_decoded();
-        self.take_fetched();
+        let arrived = self.take_fetched();
         let mut view = FrameView { complete: true, ..FrameView::default() };
         let mut wishes = Vec::new();
         (self.stats.splits_ideal, self.stats.splits_drawn) = (0, 0);
@@ -263,6 +307,7 @@ impl Terrain {
             let ask = Ask {
                 layer: &self.scene.layers[number],
                 camera,
+                exaggeration: self.options.exaggeration,
                 tolerance_pixels: self.options.tolerance_pixels,
                 splits_max: state.splits_max,
             };
@@ -277,6 +322,7 @@ impl Terrain {
             wishes.extend(drawing.wishes.into_iter().map(|wish| (number, wish)));
             state.index.trim(PAGES_MAX, state.ideal.seen());
         }
+        self.judge_streams(&arrived);
         let layers = self.layers.iter().enumerate();
         self.cache.want(layers.flat_map(|(number, state)| state.ideal.splits().map(move |d| (number, d))));
         self.wish(wishes);
@@ -320,8 +366,12 @@ impl Terrain {
         }
     }
 
-    fn take_fetched(&mut self) {
-        while let Some(event) = self.fetcher.poll() {
+    /// Takes what has been fetched, as far as there is room; the payloads among it.
+    fn take_fetched(&mut self) -> Vec<Key> {
+        let (mut arrived, mut events) = (Vec::new(), 0);
+        while self.pending_bytes < HELD_BYTES_MAX || events < EVENTS_MIN {
+            let Some(event) = self.fetcher.poll() else { break };
+            events += 1;
             match event {
                 Event::Page(layer, page, entries) => {
                     self.failed.remove(&fetch::Key::Page(layer, page));
@@ -330,6 +380,7 @@ impl Terrain {
                 Event::Payload(layer, d, payload) => {
                     self.failed.remove(&fetch::Key::Diamond(layer, d));
                     self.decode((layer, d), payload);
+                    arrived.push((layer, d));
                 }
                 Event::Failed(key, error) => {
                     tracing::warn!(%error, "given up for now");
@@ -338,6 +389,21 @@ impl Terrain {
                 }
                 Event::SceneChanged => self.scene_changed = true,
             }
+        }
+        arrived
+    }
+
+    /// Drops streams that bring what the cut does not want.
+    fn judge_streams(&mut self, arrived: &[Key]) {
+        if !self.fetcher.is_streaming() {
+            return;
+        }
+        for (number, d) in arrived {
+            let wanted = self.layers[*number].ideal.contains(*d);
+            self.strays = if wanted { 0 } else { self.strays + 1 };
+        }
+        if self.strays >= STRAYS_MAX {
+            self.fetcher.end_streams();
         }
     }
 
@@ -577,8 +643,7 @@ impl Bench {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::world::{Dice, Faults, Served, above, any_camera};
-    use glam::DVec3;
+    use crate::world::{Dice, Faults, Served, above, any_camera, world};
 
     const MINUTE: Duration = Duration::from_secs(60);
 
@@ -610,6 +675,123 @@ mod tests {
             let again = terrain.frame(&camera);
             assert_eq!(again.stats.traffic.requests, stats.traffic.requests);
         }
+    }
+
+    #[test]
+    fn a_stream_shows_a_view_in_one_round_trip_and_leaves_nothing_to_wish_for() {
+        for layers in [1, 2] {
+            let served = Served::start(layers, Faults::default());
+            let usual = open(&served, Options::default()).settle(&above(), MINUTE);
+            let mut terrain = open(&served, Options::default());
+            terrain.stream(&above());
+            let view = terrain.settle(&above(), MINUTE);
+            assert!(view.complete && view.error_pixels <= 1.0);
+            assert_eq!((view.error_pixels, view.items.len()), (usual.error_pixels, usual.items.len()));
+            let traffic = view.stats.traffic;
+            println!("{layers} layers: {traffic:?}, without a stream {:?}", usual.stats.traffic);
+            assert_eq!(traffic.requests, 1 + layers as u64, "the scene, and a stream a layer");
+            assert_eq!(traffic.errors + traffic.cancelled, 0);
+            assert!(traffic.round_trips <= 1 + layers as u64);
+        }
+    }
+
+    #[test]
+    fn a_stream_is_drawn_while_it_comes_and_gets_better() {
+        let served = Served::start(1, Faults { slow: 1.0, ..Faults::default() });
+        let mut terrain = open(&served, Options::default());
+        terrain.stream(&above());
+        let (until, mut last, mut pictures) = (Instant::now() + MINUTE, f64::INFINITY, 0);
+        while Instant::now() < until {
+            let view = terrain.frame(&above());
+            assert!(view.error_pixels <= last, "a still camera's picture never gets worse");
+            pictures += usize::from(view.error_pixels < last);
+            last = view.error_pixels;
+            if view.complete {
+                break;
+            }
+            std::thread::sleep(Duration::from_millis(3));
+        }
+        println!("{pictures} pictures, each with less error");
+        assert!(last <= 1.0 && pictures > 5);
+        assert_eq!(terrain.frame(&above()).stats.traffic.requests, 2);
+    }
+
+    #[test]
+    fn a_stream_that_fails_is_endured_and_the_rest_is_wished_for() {
+        let faults = [
+            Faults { status_500: 1.0, ..Faults::default() },
+            Faults { truncated: 1.0, ..Faults::default() },
+            Faults { damaged: 0.1, ..Faults::default() },
+            Faults { silent: 1.0, ..Faults::default() },
+            Faults { absurd: 0.1, ..Faults::default() },
+            Faults { garbage: 1.0, ..Faults::default() },
+            Faults { bomb: 1.0, ..Faults::default() },
+            Faults { unasked: 0.02, ..Faults::default() },
+            Faults { endless: 1.0, ..Faults::default() },
+        ];
+        for fault in faults {
+            let served = Served::start(2, Faults { streams_alone: true, ..fault });
+            let patience = Duration::from_millis(500);
+            let fetch = fetch::Options { patience, ..fetch::Options::default() };
+            let mut terrain = open(&served, Options { fetch, ..Options::default() });
+            terrain.stream(&above());
+            let view = terrain.settle(&above(), MINUTE);
+            println!("{fault:?}: {:?}", view.stats.traffic);
+            assert!(view.complete && view.error_pixels <= 1.0, "{fault:?}: {:?}", terrain.problem());
+            assert!(view.stats.traffic.errors + view.stats.traffic.cancelled > 0, "{fault:?} did nothing");
+            // What arrived before is not fetched again.
+            let whole: usize = world()[..2].iter().flat_map(|b| b.payloads.values()).map(Vec::len).sum();
+            assert!(fault.truncated == 0.0 || view.stats.traffic.bytes < 2 * whole as u64);
+        }
+    }
+
+    #[test]
+    fn a_stream_of_a_scene_that_is_gone_is_noticed() {
+        let served = Served::start(1, Faults::default());
+        let mut terrain = open(&served, Options::default());
+        served.misbehave(Faults { gone: true, ..Faults::default() });
+        terrain.stream(&above());
+        let view = terrain.settle(&above(), MINUTE);
+        assert!(terrain.scene_changed() && !view.complete);
+    }
+
+    #[test]
+    fn a_stream_for_a_view_that_moved_away_or_that_memory_cannot_hold_is_dropped() {
+        let served = Served::start(1, Faults { slow: 1.0, ..Faults::default() });
+        let memory_bytes = 100 * Surface::bytes(16);
+        let mut terrain = open(&served, Options { memory_bytes, ..Options::default() });
+        terrain.stream(&above());
+        let view = terrain.settle(&above(), MINUTE);
+        assert!(view.complete && view.error_pixels == view.error_pixels_goal);
+        assert!(view.stats.resident_bytes <= memory_bytes);
+        let mut terrain = open(&served, Options { tolerance_pixels: 0.2, ..Options::default() });
+        terrain.stream(&above());
+        let away = Camera { target: above().eye + DVec3::Z, ..above() };
+        let until = Instant::now() + MINUTE;
+        while terrain.fetcher.is_streaming() && Instant::now() < until {
+            terrain.frame(&away);
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        assert_eq!(terrain.frame(&away).stats.traffic.cancelled, 1);
+    }
+
+    #[test]
+    fn a_stream_waits_for_frames_that_do_not_come() {
+        let served = Served::start(1, Faults { heavy: true, ..Faults::default() });
+        let mut terrain = open(&served, Options::default());
+        terrain.stream(&above());
+        // Until nothing more arrives.
+        let mut last = (0, Instant::now());
+        while last.1.elapsed() < Duration::from_millis(500) {
+            let bytes = terrain.fetcher.traffic().bytes;
+            if bytes != last.0 {
+                last = (bytes, Instant::now());
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        println!("{} bytes, then it waits", last.0);
+        assert!(last.0 > 4 << 20 && last.0 < 8 << 20, "{}", last.0);
+        assert!(terrain.fetcher.is_streaming());
     }
 
     #[test]

@@ -4,7 +4,7 @@ use crate::camera::{Camera, FOV_Y};
 use crate::surface::Surface;
 use axum::Router;
 use axum::body::{Body, Bytes};
-use axum::extract::{Path, RawQuery, State};
+use axum::extract::{Path, Query, RawQuery, State};
 use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
@@ -12,10 +12,12 @@ use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::index::{self, Entry};
-use diamantina_protocol::message::{self, Catalogue, Frame, FrameHeader, Kind, Layer, Scene, Status};
+use diamantina_protocol::message::{
+    self, Catalogue, Frame, FrameHeader, Kind, Layer, Scene, Status, StreamAsk,
+};
 use diamantina_protocol::points::{self, Coding, Rule};
 use glam::DVec3;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 use std::time::Duration;
@@ -209,7 +211,15 @@ pub(crate) struct Faults {
     pub(crate) absurd: f64,
     pub(crate) garbage: f64,
     pub(crate) bomb: f64,
+    /// A frame that does not belong into a stream, before any of its frames.
+    pub(crate) unasked: f64,
+    /// The stream begins again when it is at its end.
+    pub(crate) endless: f64,
     pub(crate) gone: bool,
+    /// The payloads of streams are large and make no sense.
+    pub(crate) heavy: bool,
+    /// Of the answers, streams alone are spoilt.
+    pub(crate) streams_alone: bool,
 }
 
 /// A server of the scene on a free port, on a runtime of its own.
@@ -234,6 +244,12 @@ impl Serving {
     fn faults(&self) -> Faults {
         *self.faults.lock().unwrap()
     }
+
+    /// The faults of answers other than streams.
+    fn common_faults(&self) -> Faults {
+        let faults = self.faults();
+        if faults.streams_alone { Faults { gone: faults.gone, ..Faults::default() } } else { faults }
+    }
 }
 
 impl Served {
@@ -249,6 +265,7 @@ impl Served {
             .route("/scenes/{scene}", get(description))
             .route("/scenes/{scene}/{version}/{layer}/index/{page}", get(page))
             .route("/scenes/{scene}/{version}/{layer}/points", get(batch))
+            .route("/scenes/{scene}/{version}/{layer}/stream", get(stream))
             .with_state(Arc::clone(&state));
         let runtime =
             tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
@@ -290,9 +307,8 @@ async fn description(State(state): Shared, Path(name): Path<String>) -> Response
 }
 
 /// Faults that any answer may have.
-async fn common(state: &Serving) -> Option<Response> {
+async fn common(state: &Serving, faults: &Faults) -> Option<Response> {
     state.requests.fetch_add(1, Ordering::Relaxed);
-    let faults = state.faults();
     if faults.gone {
         return Some(StatusCode::GONE.into_response());
     }
@@ -312,16 +328,21 @@ async fn page(
     State(state): Shared,
     Path((_, _, layer, page)): Path<(String, String, String, u32)>,
 ) -> Response {
-    if let Some(fault) = common(&state).await {
+    let faults = state.common_faults();
+    if let Some(fault) = common(&state, &faults).await {
         return fault;
     }
-    if state.happens(state.faults().bomb) {
+    if state.happens(faults.bomb) {
         return zstd::bulk::compress(&vec![0u8; 64 << 20], 1).unwrap().into_response();
     }
     let built = world().iter().find(|built| built.layer.name == layer).unwrap();
+    page_blob(built, page).into_response()
+}
+
+fn page_blob(built: &Built, page: u32) -> Vec<u8> {
     let diamonds = index::page_diamonds(&built.layer.forest, page).unwrap();
     let entries: Vec<Entry> = diamonds.iter().map(|d| built.entries[d]).collect();
-    zstd::bulk::compress(&index::encode(&entries), 3).unwrap().into_response()
+    zstd::bulk::compress(&index::encode(&entries), 3).unwrap()
 }
 
 async fn batch(
@@ -329,10 +350,10 @@ async fn batch(
     Path((_, _, layer)): Path<(String, String, String)>,
     RawQuery(query): RawQuery,
 ) -> Response {
-    if let Some(fault) = common(&state).await {
+    let faults = state.common_faults();
+    if let Some(fault) = common(&state, &faults).await {
         return fault;
     }
-    let faults = state.faults();
     let built = world().iter().find(|built| built.layer.name == layer).unwrap();
     let centres = message::parse_batch(query.unwrap().strip_prefix("d=").unwrap()).unwrap();
     let mut body = Vec::new();
@@ -353,6 +374,11 @@ async fn batch(
         header.write(&mut body);
         body.extend(payload);
     }
+    in_pieces(&state, &faults, body)
+}
+
+/// The answer in pieces, cut off or late if so it happens.
+fn in_pieces(state: &Serving, faults: &Faults, mut body: Vec<u8>) -> Response {
     if state.happens(faults.truncated) {
         body.truncate(body.len() / 2);
     }
@@ -366,4 +392,75 @@ async fn batch(
         Some((Ok::<_, std::io::Error>(Bytes::from(chunk)), chunks))
     });
     Body::from_stream(stream).into_response()
+}
+
+/// What a view wants, in the order of levels; not that of errors, which no client may count on.
+fn wanted(built: &Built, ask: &StreamAsk) -> Vec<Diamond> {
+    let (layer, view) = (&built.layer, ask.view.as_ref().unwrap());
+    let is_seen = |d: &Diamond| {
+        let entry = built.entries[d];
+        let [low, high] = layer.forest.bounds(*d).map(|p| layer.position(p));
+        let low = DVec3::new(low[0], low[1], layer.metres(entry.low));
+        let high = DVec3::new(high[0], high[1], layer.metres(entry.high));
+        let eye = DVec3::from_array(view.eye);
+        let distance = (eye.clamp(low, high) - eye).length();
+        !entry.is_empty() && (d.level() == 0 || f64::from(entry.error_metres) > view.angle * distance)
+    };
+    let mut wanted: HashSet<Diamond> = built.diamonds.iter().copied().filter(is_seen).collect();
+    for d in built.diamonds.iter().rev() {
+        if wanted.contains(d) {
+            wanted.extend(layer.forest.parents(*d));
+        }
+    }
+    built.diamonds.iter().copied().filter(|d| wanted.contains(d)).collect()
+}
+
+async fn stream(
+    State(state): Shared,
+    Path((_, _, layer)): Path<(String, String, String)>,
+    Query(query): Query<HashMap<String, String>>,
+) -> Response {
+    let faults = state.faults();
+    if let Some(fault) = common(&state, &faults).await {
+        return fault;
+    }
+    let built = world().iter().find(|built| built.layer.name == layer).unwrap();
+    let forest = &built.layer.forest;
+    let ask = message::parse_stream(query.iter().map(|(k, v)| (k.as_str(), v.as_str()))).unwrap();
+    let mut body = Vec::new();
+    let mut pages = HashSet::new();
+    for d in wanted(built, &ask) {
+        for around in forest.children(d).into_iter().flatten().chain([d]) {
+            let page = index::page_of(forest, around);
+            if pages.insert(page) {
+                let bomb = state.happens(faults.bomb);
+                let blob = if bomb {
+                    zstd::bulk::compress(&vec![0u8; 64 << 20], 1).unwrap()
+                } else {
+                    page_blob(built, page)
+                };
+                FrameHeader::of_page(page, &blob).write(&mut body);
+                body.extend(blob);
+            }
+        }
+        if state.happens(faults.unasked) {
+            FrameHeader::of([1, 1], &[]).write(&mut body);
+        }
+        let mut payload = if faults.heavy { vec![1; 200 << 10] } else { built.payloads[&d].clone() };
+        let mut header = FrameHeader::of(d.centre(), &payload);
+        if state.happens(faults.damaged) && !payload.is_empty() {
+            payload[3] ^= 64;
+        }
+        if state.happens(faults.absurd / 8.0) {
+            header.length = u32::MAX;
+        }
+        header.write(&mut body);
+        body.extend(payload);
+    }
+    if state.happens(faults.endless) {
+        let again =
+            futures_util::stream::repeat_with(move || Ok::<_, std::io::Error>(Bytes::from(body.clone())));
+        return Body::from_stream(again).into_response();
+    }
+    in_pieces(&state, &faults, body)
 }

@@ -7,6 +7,7 @@ use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::index::{self, Entry};
 use diamantina_protocol::points::{self, Coding, Rule};
 use std::collections::HashMap;
+use std::convert::Infallible;
 use std::hint::black_box;
 
 /// One root square of 1024 cells in patches of 64 segments: eight levels.
@@ -44,9 +45,10 @@ struct Case {
     payload: Vec<u8>,
 }
 
-fn case(fine_step: u32) -> Case {
+/// `coarse`: whether old points have a coarser step, so that each is corrected as well.
+fn case(fine_step: u32, coarse: bool) -> Case {
     let forest = forest();
-    let exponents = vec![4, 4, 3, 3, 2, 2, 1, 1, 0];
+    let exponents = if coarse { vec![4, 4, 3, 3, 2, 2, 1, 1, 0] } else { vec![0; 9] };
     let coding = Coding::new(Rule::Smooth, fine_step, exponents).expect("falling exponents, odd step");
     let source_of = |d: Diamond| {
         let mut block = Block::empty(&forest);
@@ -61,6 +63,9 @@ fn case(fine_step: u32) -> Case {
         block
     };
     let finest = forest.levels() - 1;
+    let some: Vec<Diamond> = forest.diamonds(finest).step_by(6).collect();
+    let Ok(model) = points::train(&forest, &coding, &some, |d| Ok::<_, Infallible>(source_of(d)));
+    let coding = coding.with_model(model);
     let mut before = HashMap::new();
     for level in 0..finest {
         let mut here = HashMap::new();
@@ -82,8 +87,15 @@ fn points(c: &mut Criterion) {
     let mut group = c.benchmark_group("points");
     let new_points = forest().segments().pow(2) as u64;
     group.throughput(Throughput::Elements(new_points));
-    for (name, fine_step) in [("lossless", 1), ("error_5_m", 11)] {
-        let case = case(fine_step);
+    let cases = [
+        ("lossless", 1, false),
+        ("lossless_corrected", 1, true),
+        ("error_1_m", 3, false),
+        ("error_1_m_corrected", 3, true),
+        ("error_5_m", 11, false),
+    ];
+    for (name, fine_step, coarse) in cases {
+        let case = case(fine_step, coarse);
         println!("{name}: {} bytes for {new_points} new points", case.payload.len());
         group.bench_function(format!("encode/{name}"), |b| {
             b.iter_batched_ref(

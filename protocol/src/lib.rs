@@ -8,7 +8,7 @@
 //! | [`diamond`] | pairs of triangles that split together; the local grid of a diamond |
 //! | [`bitree`] | a set of points, real and fictitious, and the one triangulation it implies |
 //! | [`points`] | the progressive points of a diamond ⇄ bytes |
-//! | [`entropy`] | the adaptive binary coder under [`points`] |
+//! | [`rans`] | the entropy coder under [`points`] |
 //! | [`index`] | pages of errors, heights and sizes, from which a client knows the cut |
 //! | [`message`] | routes, catalogue, batch frames |
 //! | [`wire`] | the one place that knows the serialisation crate |
@@ -21,10 +21,10 @@
 pub mod bintree;
 pub mod bitree;
 pub mod diamond;
-pub mod entropy;
 pub mod index;
 pub mod message;
 pub mod points;
+pub mod rans;
 pub mod wire;
 
 /// The height of a point that has none.

@@ -2,6 +2,11 @@
 //!
 //! Routes are written and read here only, so that client and server cannot drift apart. The catalogue is
 //! JSON (people read it); a batch is a sequence of frames, each a header and a payload.
+//!
+//! **A stream** is a batch whose list the server makes: of what a [`StreamAsk`] wants, the largest error
+//! first. The roots of the whole layer come before all else, and a diamond after its parents, so any prefix
+//! of whole frames is a surface. Between the diamonds come pages of the index, each once, before the first
+//! diamond that it describes or whose children it describes: so any prefix also tells its own errors.
 
 use crate::bintree::{Forest, Point};
 use crate::points::Coding;
@@ -227,21 +232,181 @@ fn whole(text: &str) -> Option<u32> {
     text.bytes().all(|b| b.is_ascii_digit()).then(|| text.parse().ok())?
 }
 
-/// What a frame of a batch says of its diamond.
+/// The most diamonds in a stream. A client goes on with ordinary requests, or asks for less.
+pub const STREAM_MAX: usize = 32 << 10;
+
+/// The most sides of a view.
+pub const SIDES_MAX: usize = 8;
+
+/// What a stream shall hold: the diamonds that touch the box, are in view and have a declared error above
+/// both bounds, with all their ancestors; and the layer's roots in any case.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct StreamAsk {
+    /// `bbox=x0,y0,x1,y1`: the region in the frame's metres, its borders included. None: the whole layer.
+    pub bbox: Option<[f64; 4]>,
+    /// `error=M`: the declared error, in metres, that needs no refining. 0: down to the finest level, but for
+    /// what is exact before.
+    pub error: f64,
+    /// Where it is seen from, if it is. Then the largest *apparent* error comes first.
+    pub view: Option<StreamView>,
+    /// `limit=BYTES`: the stream ends with the frame that reaches so many.
+    pub limit: Option<u64>,
+}
+
+/// Where a stream is seen from: no more of a camera than an order of refinement needs.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct StreamView {
+    /// `eye=x,y,z`: in the frame's metres.
+    pub eye: [f64; 3],
+    /// `angle=A`: the apparent error that needs no refining, in radians: the declared error over the distance
+    /// of the eye from the box around the diamond (its square of the frame, its lowest and highest height). A
+    /// client that draws P pixels a radian and bears E pixels of error asks for E/P.
+    pub angle: f64,
+    /// `sides=x,y,z;...`: the half spaces that are seen, at most [`SIDES_MAX`], each through the eye and with
+    /// this vector pointing inside. What lies wholly beyond one of them is not in view. None: all around.
+    pub sides: Vec<[f64; 3]>,
+}
+
+/// Why parameters do not ask for a stream.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum StreamError {
+    /// A value that is none.
+    #[error("{name}={found}: expected {expected}")]
+    Value {
+        /// The parameter.
+        name: &'static str,
+        /// The value found.
+        found: String,
+        /// What it must be.
+        expected: &'static str,
+    },
+    /// Not a parameter.
+    #[error(
+        "'{0}' is no parameter of a stream: expected bbox, error, eye, angle, sides, limit, each at most once"
+    )]
+    Name(String),
+    /// Half a view.
+    #[error(
+        "eye= and angle= go together, and sides= with them: an order by distance needs all it is made of"
+    )]
+    View,
+}
+
+/// The path and query of a stream.
+#[must_use]
+pub fn stream_route(scene: &str, version: &str, layer: &str, ask: &StreamAsk) -> String {
+    let mut route = format!("/scenes/{scene}/{version}/{layer}/stream?error={}", ask.error);
+    // Writing to a String cannot fail.
+    if let Some([x0, y0, x1, y1]) = ask.bbox {
+        let _ = write!(route, "&bbox={x0},{y0},{x1},{y1}");
+    }
+    if let Some(StreamView { eye: [x, y, z], angle, sides }) = &ask.view {
+        let _ = write!(route, "&eye={x},{y},{z}&angle={angle}");
+        for (i, [x, y, z]) in sides.iter().enumerate() {
+            let _ = write!(route, "{}{x},{y},{z}", if i == 0 { "&sides=" } else { ";" });
+        }
+    }
+    if let Some(bytes) = ask.limit {
+        let _ = write!(route, "&limit={bytes}");
+    }
+    route
+}
+
+/// What the names and values of a query ask for. They may be hostile.
+///
+/// # Errors
+/// When they make no sense.
+pub fn parse_stream<'a>(
+    pairs: impl IntoIterator<Item = (&'a str, &'a str)>,
+) -> Result<StreamAsk, StreamError> {
+    let mut ask = StreamAsk::default();
+    let (mut seen, mut eye, mut angle, mut sides) = (Vec::new(), None, None, None);
+    for (name, text) in pairs {
+        let fail = |name, expected| StreamError::Value { name, found: excerpt(text), expected };
+        if seen.contains(&name) {
+            return Err(StreamError::Name(excerpt(name)));
+        }
+        seen.push(name);
+        match name {
+            "bbox" => {
+                let bbox = finite(text).filter(|[x0, y0, x1, y1]| x0 <= x1 && y0 <= y1);
+                let expected = "x0,y0,x1,y1 in metres, with x0 <= x1 and y0 <= y1";
+                ask.bbox = Some(bbox.ok_or_else(|| fail("bbox", expected))?);
+            }
+            "error" => {
+                let error = finite(text).filter(|[error]| *error >= 0.0);
+                [ask.error] = error.ok_or_else(|| fail("error", "metres, 0 or more"))?;
+            }
+            "limit" => {
+                let bytes = text.parse().ok().filter(|bytes| *bytes > 0);
+                ask.limit = Some(bytes.ok_or_else(|| fail("limit", "bytes, 1 or more"))?);
+            }
+            "eye" => eye = Some(finite(text).ok_or_else(|| fail("eye", "x,y,z in metres"))?),
+            "angle" => {
+                let value = finite(text).filter(|[angle]| *angle > 0.0);
+                let [value] = value.ok_or_else(|| fail("angle", "radians, above 0"))?;
+                angle = Some(value);
+            }
+            "sides" => {
+                let expected = "at most 8 vectors x,y,z;x,y,z;... that point inside";
+                sides = Some(vectors(text).ok_or_else(|| fail("sides", expected))?);
+            }
+            _ => return Err(StreamError::Name(excerpt(name))),
+        }
+    }
+    ask.view = match (eye, angle, sides) {
+        (Some(eye), Some(angle), sides) => Some(StreamView { eye, angle, sides: sides.unwrap_or_default() }),
+        (None, None, None) => None,
+        _ => return Err(StreamError::View),
+    };
+    Ok(ask)
+}
+
+/// The beginning of a text, fit for a message.
+fn excerpt(text: &str) -> String {
+    text.chars().take(40).collect()
+}
+
+/// So many finite numbers with commas between.
+fn finite<const N: usize>(text: &str) -> Option<[f64; N]> {
+    let mut numbers = [0.0; N];
+    let mut parts = text.split(',');
+    for number in &mut numbers {
+        *number = parts.next()?.parse().ok().filter(|n: &f64| n.is_finite())?;
+    }
+    parts.next().is_none().then_some(numbers)
+}
+
+/// Up to [`SIDES_MAX`] vectors, none of them without a direction.
+fn vectors(text: &str) -> Option<Vec<[f64; 3]>> {
+    let mut list = Vec::new();
+    for part in text.split(';') {
+        let vector = finite(part).filter(|v: &[f64; 3]| v.iter().any(|x| *x != 0.0))?;
+        if list.len() == SIDES_MAX {
+            return None;
+        }
+        list.push(vector);
+    }
+    Some(list)
+}
+
+/// What a frame of a batch or stream holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Status {
-    /// The payload follows.
+    /// The diamond's payload follows. In a stream it may have no bytes: the split adds no height.
     Ok,
     /// There is no such diamond, or it has no payload.
     Missing,
     /// The store's copy is damaged.
     Damaged,
+    /// A page of the index follows, as it is stored; only in a stream.
+    Page,
 }
 
-/// One diamond of a batch.
+/// One diamond of a batch, or a diamond or page of a stream.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FrameHeader {
-    /// The diamond's centre.
+    /// The diamond's centre; of a page its number, and 0.
     pub centre: Point,
     /// What follows.
     pub status: Status,
@@ -269,6 +434,12 @@ impl FrameHeader {
         Self { centre, status: Status::Ok, length, checksum: checksum(payload) }
     }
 
+    /// The header of a page of the index.
+    #[must_use]
+    pub fn of_page(page: u32, blob: &[u8]) -> Self {
+        Self { status: Status::Page, ..Self::of([page, 0], blob) }
+    }
+
     /// The header of a diamond that cannot be sent.
     #[must_use]
     pub fn without(centre: Point, status: Status) -> Self {
@@ -281,6 +452,7 @@ impl FrameHeader {
             Status::Ok => 0u8,
             Status::Missing => 1,
             Status::Damaged => 2,
+            Status::Page => 3,
         };
         out.extend(wire::to_bytes(&(self.centre, status, self.length, self.checksum)));
     }
@@ -301,6 +473,7 @@ impl FrameHeader {
             0 => Status::Ok,
             1 => Status::Missing,
             2 => Status::Damaged,
+            3 => Status::Page,
             other => return Err(WireError::Damaged(format!("status {other}"))),
         };
         if length > PAYLOAD_BYTES_MAX {
@@ -337,12 +510,96 @@ mod tests {
         }
 
         #[test]
+        fn a_page_comes_back(page in any::<u32>(), blob in prop::collection::vec(any::<u8>(), 0..50)) {
+            let header = FrameHeader::of_page(page, &blob);
+            let mut bytes = Vec::new();
+            header.write(&mut bytes);
+            let used = bytes.len();
+            prop_assert_eq!(FrameHeader::read(&bytes), Ok(Some((header, used))));
+        }
+
+        #[test]
+        fn a_stream_request_comes_back(ask in any_stream()) {
+            let route = stream_route("s", "v", "terrain", &ask);
+            prop_assert_eq!(parse_stream(pairs(route.split_once('?').unwrap().1)), Ok(ask));
+        }
+
+        #[test]
+        fn any_text_is_a_stream_request_or_an_error(text in "(bbox|error|eye|angle|sides|limit|x)=[-0-9.,;einaf&=]{0,40}.{0,20}") {
+            if let Ok(ask) = parse_stream(pairs(&text)) {
+                let route = stream_route("s", "v", "l", &ask);
+                prop_assert_eq!(parse_stream(pairs(route.split_once('?').unwrap().1)), Ok(ask));
+            }
+        }
+
+        #[test]
         fn any_text_is_a_batch_or_an_error(text in ".{0,60}") { let _ = parse_batch(&text); }
 
         #[test]
         fn any_bytes_are_a_frame_or_an_error(bytes in prop::collection::vec(any::<u8>(), 0..40)) {
             if let Ok(Some((header, _))) = FrameHeader::read(&bytes) { prop_assert!(header.length <= PAYLOAD_BYTES_MAX); }
         }
+    }
+
+    fn pairs(query: &str) -> impl Iterator<Item = (&str, &str)> {
+        query.split('&').map(|pair| pair.split_once('=').unwrap_or((pair, "")))
+    }
+
+    fn any_number() -> impl Strategy<Value = f64> {
+        prop_oneof![any::<f64>().prop_filter("finite", |x| x.is_finite()), -1e7..1e7]
+    }
+
+    fn any_stream() -> impl Strategy<Value = StreamAsk> {
+        let direction = [any_number(), any_number(), any_number()];
+        let direction = direction.prop_filter("a direction", |v| v.iter().any(|x| *x != 0.0));
+        let sides = prop::collection::vec(direction, 0..=SIDES_MAX);
+        let positive = any_number().prop_map(f64::abs).prop_filter("above 0", |x| *x > 0.0);
+        let view = ([any_number(), any_number(), any_number()], positive, sides);
+        let view = view.prop_map(|(eye, angle, sides)| StreamView { eye, angle, sides });
+        let bbox = [any_number(), any_number(), any_number(), any_number()];
+        let bbox = bbox.prop_map(|[a, b, c, d]| [a.min(c), b.min(d), a.max(c), b.max(d)]);
+        let parts = (
+            prop::option::of(bbox),
+            any_number().prop_map(f64::abs),
+            prop::option::of(view),
+            prop::option::of(1u64..),
+        );
+        parts.prop_map(|(bbox, error, view, limit)| StreamAsk { bbox, error, view, limit })
+    }
+
+    #[test]
+    fn wrong_stream_requests_are_named() {
+        assert_eq!(parse_stream([]), Ok(StreamAsk::default()), "the whole layer");
+        for (text, word) in [
+            ("bbox=1,2,3", "bbox=1,2,3: expected x0,y0,x1,y1"),
+            ("bbox=1,2,3,4,5", "x0 <= x1"),
+            ("bbox=3,2,1,4", "x0 <= x1"),
+            ("bbox=1,4,3,2", "y0 <= y1"),
+            ("bbox=1,2,3,nan", "bbox=1,2,3,nan"),
+            ("bbox=1,2,3,inf", "x0 <= x1"),
+            ("error=nan", "error=nan: expected metres, 0 or more"),
+            ("error=-1", "metres"),
+            ("error=1e999", "metres"),
+            ("error=", "metres"),
+            ("error=1&error=2", "at most once"),
+            ("limit=0", "bytes, 1 or more"),
+            ("limit=-1", "bytes"),
+            ("limit=1.5", "bytes"),
+            ("eye=1,2,3", "eye= and angle= go together"),
+            ("angle=1", "eye= and angle= go together"),
+            ("eye=1,2,3&angle=0", "radians, above 0"),
+            ("eye=1,2&angle=1", "x,y,z in metres"),
+            ("eye=1,2,3&angle=1&sides=0,0,0", "point inside"),
+            ("sides=1,0,0", "go together"),
+            ("eror=1", "'eror' is no parameter"),
+        ] {
+            let error = parse_stream(pairs(text)).unwrap_err().to_string();
+            assert!(error.contains(word), "{text}: {error}");
+        }
+        let many = ["1,0,0"; SIDES_MAX + 1].join(";");
+        assert!(parse_stream([("eye", "0,0,0"), ("angle", "1"), ("sides", &many)]).is_err());
+        // A long value is not repeated whole.
+        assert!(parse_stream([("error", "9,".repeat(5000).as_str())]).unwrap_err().to_string().len() < 200);
     }
 
     #[test]

@@ -63,7 +63,8 @@ pub fn run(folder: &Path, samples: u32, listen: SocketAddr, headless: bool) -> R
         move |error| DemoError::Io { path, error }
     };
     std::fs::create_dir_all(folder).map_err(at(folder))?;
-    let client = std::env::current_exe().map_err(at(folder))?.with_file_name("diamantina-client");
+    let server_program = std::env::current_exe().map_err(at(folder))?;
+    let client = server_program.with_file_name("diamantina-client");
     if !client.exists() {
         return Err(DemoError::NoClient(client));
     }
@@ -107,9 +108,16 @@ pub fn run(folder: &Path, samples: u32, listen: SocketAddr, headless: bool) -> R
         });
         let drawn = draw(&client, &url, &picture);
         if drawn.is_ok() {
-            say(&format!("Picture: {}\nServing {url}", picture.display()));
+            say(&format!("Picture: {}", picture.display()));
             let program = client.display();
-            say("Go on with, for instance:");
+            let url = if headless {
+                say("Go on with, for instance:");
+                say(&format!("  {} serve {} --listen {listen}", server_program.display(), store.display()));
+                format!("http://{listen}/scenes/sample")
+            } else {
+                say(&format!("Serving {url}\nGo on with, for instance:"));
+                url.clone()
+            };
             let [eye, target] = NEAR.map(|view| position(view, samples));
             say(&format!("  {program} render {url} -o near.png --eye {eye} --target {target}"));
             let [x, y] = sample::place(NEAR[1][0], NEAR[1][1], samples);

@@ -74,6 +74,9 @@ fn projection(crs: Option<&Crs>) -> Result<(Projection, &Crs), HeightError> {
 pub fn to_frame(crs: Option<&Crs>, lon: f64, lat: f64) -> Result<[f64; 2], HeightError> {
     let (projection, crs) = projection(crs)?;
     let (x, y) = projection.forward(lon, lat).ok_or(HeightError::Unprojectable { lon, lat })?;
+    // Longitudes of the frame may run from 0 to 360, or beyond 180: this is the same place, counted from its
+    // south-west sample.
+    let x = if projection.is_geographic() && x < crs.origin[0] - 1e-9 { x + 360.0 } else { x };
     Ok([(x - crs.origin[0]) / crs.per_metre[0], (y - crs.origin[1]) / crs.per_metre[1]])
 }
 
@@ -81,7 +84,10 @@ pub fn to_frame(crs: Option<&Crs>, lon: f64, lat: f64) -> Result<[f64; 2], Heigh
 #[must_use]
 pub fn to_lonlat(crs: Option<&Crs>, [x, y]: [f64; 2]) -> Option<(f64, f64)> {
     let (projection, crs) = projection(crs).ok()?;
-    projection.inverse(crs.origin[0] + x * crs.per_metre[0], crs.origin[1] + y * crs.per_metre[1])
+    let (lon, lat) =
+        projection.inverse(crs.origin[0] + x * crs.per_metre[0], crs.origin[1] + y * crs.per_metre[1])?;
+    let beyond = !(-180.0..=180.0).contains(&lon);
+    Some((if beyond { (lon + 180.0).rem_euclid(360.0) - 180.0 } else { lon }, lat))
 }
 
 /// The height of a layer at frame coordinates `[x, y]`, on the finest surface: the plane of the bintree
@@ -97,7 +103,8 @@ pub fn height(
     [x, y]: [f64; 2],
 ) -> Result<HeightAnswer, HeightError> {
     let cells = layer.samples.map(|s| f64::from(s - 1));
-    let at = [(x - layer.origin[0]) / layer.cell[0], (y - layer.origin[1]) / layer.cell[1]];
+    let found = [0, 1].map(|axis| in_cells([x, y][axis], layer.origin[axis], layer.cell[axis]));
+    let (at, rounding) = (found.map(|f| f.0), found[0].1 + found[1].1);
     if !(0.0..=cells[0]).contains(&at[0]) || !(0.0..=cells[1]).contains(&at[1]) {
         let [west, south] = layer.origin;
         let (east, north) = (west + cells[0] * layer.cell[0], south + cells[1] * layer.cell[1]);
@@ -135,10 +142,10 @@ pub fn height(
             let [p, q] = local.local2(corner.map(i64::from));
             let h = block.heights()[Block::slot(n as usize, p as usize, q as usize)];
             let part = (h != NODATA).then(|| f64::from(h) * weight);
-            // A corner without weight has no say: on an edge, what lies beyond may be nodata.
+            // A corner without weight, but for rounding, has no say: on an edge, what lies beyond may be nodata.
             height = match (height, part) {
                 (Some(sum), Some(part)) => Some(sum + part),
-                (Some(sum), None) if weight == 0.0 => Some(sum),
+                (Some(sum), None) if weight <= rounding => Some(sum),
                 _ => None,
             };
         }
@@ -156,6 +163,15 @@ pub fn height(
         error: f64::from(layer.finest_error),
         nodata: metres.is_none(),
     })
+}
+
+/// A coordinate in cells from the first sample, and how far off rounding may have put it. What is a sample but
+/// for rounding is that sample: else the last one would lie outside.
+fn in_cells(coordinate: f64, origin: f64, cell: f64) -> (f64, f64) {
+    let at = (coordinate - origin) / cell;
+    // Of the place of the sample, of the caller's sum, and of the two operations above: half an ulp each.
+    let rounding = 2.0 * f64::EPSILON * (coordinate.abs().max(origin.abs()) / cell + at.abs());
+    (if (at - at.round()).abs() <= rounding { at.round() } else { at }, rounding)
 }
 
 /// Decodes a diamond with its ancestors.

@@ -7,6 +7,7 @@
 
 use crate::height::{self, HeightError};
 use crate::store::{Key, Kind, Store, StoreError};
+use crate::stream::Stream;
 use axum::Router;
 use axum::body::{Body, Bytes};
 use axum::extract::{Path as UrlPath, Query, Request, State};
@@ -16,7 +17,7 @@ use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
 use diamantina_protocol::index;
 use diamantina_protocol::message::{
-    self, BATCH_MAX, Catalogue, FrameHeader, Layer, PAYLOAD_BYTES_MAX, Problem, Scene, Status,
+    self, BATCH_MAX, Catalogue, FrameHeader, Layer, PAYLOAD_BYTES_MAX, Problem, STREAM_MAX, Scene, Status,
 };
 use std::collections::{BTreeMap, HashMap};
 use std::io::{Read as _, Write as _};
@@ -30,6 +31,9 @@ const DRAIN: Duration = Duration::from_secs(10);
 
 /// Frames of a batch that may wait for a slow reader.
 const FRAMES_AHEAD: usize = 16;
+
+/// Bytes of a stream that are made at once: what waits for a slow reader, but for one frame more.
+const STREAM_PIECE_BYTES: usize = 16 << 10;
 
 /// Why a server cannot start or stops.
 #[derive(Debug, thiserror::Error)]
@@ -191,6 +195,7 @@ pub fn router(scenes: Scenes) -> Router {
         .route("/scenes/{scene}/{version}/{layer}/index/{page}", get(index_page))
         .route("/scenes/{scene}/{version}/{layer}/points", get(batch))
         .route("/scenes/{scene}/{version}/{layer}/points/{x}/{y}", get(diamond))
+        .route("/scenes/{scene}/{version}/{layer}/stream", get(stream))
         .fallback(|| async {
             Refusal::new(StatusCode::NOT_FOUND, "no such address: GET /scenes lists what there is")
         })
@@ -252,18 +257,22 @@ fn tagged(
     tag: &str,
     cache: &'static str,
     kind: &'static str,
-    body: impl FnOnce() -> Bytes,
+    body: impl FnOnce() -> Body,
 ) -> Response {
-    let tag = format!("\"{tag}\"");
-    let known = headers.get_all(header::IF_NONE_MATCH).iter().filter_map(|v| v.to_str().ok());
-    let fresh = known
-        .flat_map(|v| v.split(','))
-        .any(|v| matches!(v.trim(), "*") || v.trim().trim_start_matches("W/") == tag);
-    let common = [(header::ETAG, tag), (header::CACHE_CONTROL, cache.to_owned())];
-    if fresh {
+    let common = [(header::ETAG, format!("\"{tag}\"")), (header::CACHE_CONTROL, cache.to_owned())];
+    if is_known(headers, tag) {
         return (StatusCode::NOT_MODIFIED, common).into_response();
     }
     (common, [(header::CONTENT_TYPE, kind)], body()).into_response()
+}
+
+/// Whether the client has the answer with this tag already.
+fn is_known(headers: &HeaderMap, tag: &str) -> bool {
+    let tag = format!("\"{tag}\"");
+    let known = headers.get_all(header::IF_NONE_MATCH).iter().filter_map(|v| v.to_str().ok());
+    known
+        .flat_map(|v| v.split(','))
+        .any(|v| matches!(v.trim(), "*") || v.trim().trim_start_matches("W/") == tag)
 }
 
 const IMMUTABLE: &str = "public, max-age=31536000, immutable";
@@ -344,7 +353,7 @@ async fn index_page(
     };
     let page: u32 = page.parse().map_err(|_| missing())?;
     let blob = store.get(Key { layer: number, kind: Kind::Index, a: page, b: 0 })?.ok_or_else(missing)?;
-    Ok(tagged(&headers, &format!("{version}-{number}-i{page}"), IMMUTABLE, OCTETS, || blob))
+    Ok(tagged(&headers, &format!("{version}-{number}-i{page}"), IMMUTABLE, OCTETS, || blob.into()))
 }
 
 async fn diamond(
@@ -360,7 +369,7 @@ async fn diamond(
     let blob = store
         .get(Key { layer: number, kind: Kind::Points, a: centre[0], b: centre[1] })?
         .ok_or_else(no_diamond)?;
-    Ok(tagged(&headers, &format!("{version}-{number}-p{x}-{y}"), IMMUTABLE, OCTETS, || blob))
+    Ok(tagged(&headers, &format!("{version}-{number}-p{x}-{y}"), IMMUTABLE, OCTETS, || blob.into()))
 }
 
 async fn batch(
@@ -419,6 +428,41 @@ fn batch_frame(store: &Store, layer: u8, centre: [u32; 2]) -> Bytes {
         }
     }
     out.into()
+}
+
+async fn stream(
+    State(scenes): State<Scenes>,
+    UrlPath((name, version, layer)): UrlPath<(String, String, String)>,
+    Query(query): Query<Vec<(String, String)>>,
+    headers: HeaderMap,
+) -> Result<Response, Refusal> {
+    let store = Arc::clone(find_version(&scenes, &name, &version)?);
+    let (number, layer) = find_layer(&store, &layer)?;
+    let ask = message::parse_stream(query.iter().map(|(name, value)| (name.as_str(), value.as_str())))
+        .map_err(|e| Refusal::new(StatusCode::BAD_REQUEST, e.to_string()))?;
+    // However it was written, the same question has the same tag.
+    let asked = blake3::hash(message::stream_route("", "", "", &ask).as_bytes()).to_hex();
+    let tag = format!("{version}-{number}-s{}", &asked[..16]);
+    let stream = Stream::new(Arc::clone(&store), number, layer, ask, STREAM_MAX);
+    Ok(tagged(&headers, &tag, IMMUTABLE, OCTETS, || Body::from_stream(pieces(stream))))
+}
+
+/// The bytes of a stream. Each piece is made when the one before has gone out, on a thread that it leaves at
+/// once: a slow reader keeps what the stream remembers and one piece, and no thread.
+fn pieces(stream: Stream) -> impl futures_util::Stream<Item = Result<Bytes, std::io::Error>> {
+    futures_util::stream::unfold(Some(stream), |stream| async move {
+        let mut stream = stream?;
+        let made = tokio::task::spawn_blocking(move || (stream.next_piece(STREAM_PIECE_BYTES), stream)).await;
+        match made {
+            Ok((Ok(piece), stream)) => piece.map(|piece| (Ok(piece), Some(stream))),
+            Ok((Err(error), _)) => {
+                tracing::error!(%error, "stream");
+                // The answer is cut off, so that the reader knows.
+                Some((Err(std::io::Error::other("the store is damaged here")), None))
+            }
+            Err(error) => Some((Err(std::io::Error::other(error)), None)),
+        }
+    })
 }
 
 async fn height_at(

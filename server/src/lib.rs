@@ -2,6 +2,7 @@
 
 pub mod canvas;
 pub mod chunks;
+pub mod curve;
 pub mod demo;
 pub mod height;
 pub mod hierarchy;
@@ -13,3 +14,4 @@ pub mod progress;
 pub mod projection;
 pub mod sample;
 pub mod store;
+pub mod stream;

@@ -7,9 +7,9 @@ use diamantina_server::hierarchy::{self, BuildError, Estimate, Report};
 use diamantina_server::ingest::IngestError;
 use diamantina_server::inspect::{self, Inspection};
 use diamantina_server::progress::Progress;
-use diamantina_server::store::Store;
-use diamantina_server::{demo, http, ingest};
-use std::io::Write;
+use diamantina_server::store::{Store, StoreError};
+use diamantina_server::{curve, demo, http, ingest};
+use std::io::{IsTerminal, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -41,7 +41,8 @@ enum Command {
 
 #[derive(Args)]
 struct BuildArgs {
-    /// DEM files of one layer: GeoTIFF, .hgt, Arc ASCII, USGS DEM, PNG, raw; .gz and .zip of these
+    /// DEM files of one layer: GeoTIFF, .hgt, Arc ASCII, USGS DEM or PNG, also in a .gz, or alone in a .zip; raw,
+    /// also in a .gz
     #[arg(required = true, value_name = "DEM")]
     sources: Vec<PathBuf>,
     /// The folder of the store; an older scene in it is replaced once the new one is complete
@@ -54,8 +55,8 @@ struct BuildArgs {
     #[arg(long, default_value = "2GiB", value_name = "BYTES", value_parser = parse_bytes)]
     memory: u64,
     /// Threads [default: one a core]
-    #[arg(long, value_name = "N")]
-    threads: Option<usize>,
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
     /// Encodings to build
     #[arg(long, default_value = "points", value_enum, value_delimiter = ',')]
     encoding: Vec<Encoding>,
@@ -118,6 +119,10 @@ struct InspectArgs {
     /// Read, check and decode every blob
     #[arg(long)]
     verify: bool,
+    /// Write, for each prefix of each layer's progressive stream, its bytes and its declared and true errors
+    /// here (- for standard output, and nothing else)
+    #[arg(long, value_name = "CSV")]
+    curve: Option<PathBuf>,
 }
 
 #[derive(Args)]
@@ -177,9 +182,20 @@ impl<E: std::error::Error> From<E> for Failure {
     }
 }
 
+/// What became of printing results. That nobody reads any more, as behind `| head`, is no failure.
+fn shown(printed: std::io::Result<()>) -> std::io::Result<()> {
+    match printed {
+        Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        other => other,
+    }
+}
+
 fn main() -> ExitCode {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| "warn".into());
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    let colours =
+        std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty());
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours);
+    log.with_writer(std::io::stderr).init();
     let result = match Cli::parse().command {
         Command::Build(args) => build(*args),
         Command::Serve(args) => serve(&args.stores, args.listen),
@@ -215,15 +231,26 @@ fn scene_name(given: Option<String>, store: &Path) -> Result<String, Failure> {
     let fit: String = folder
         .chars()
         .map(|c| if c.is_ascii_alphanumeric() || "._-".contains(c) { c } else { '-' })
-        .take(64)
         .collect();
     let fit = fit.trim_start_matches('.').to_owned();
-    Ok(if fit.is_empty() { "scene".to_owned() } else { fit })
+    match fit.as_str() {
+        "" => Ok("scene".to_owned()),
+        name if is_name(name) => Ok(fit),
+        name => Err(Failure(
+            2,
+            format!(
+                "{}: expected a folder whose name can be the scene's, at most 64 characters, found {}: \
+                 name the scene with --scene NAME",
+                store.display(),
+                name.len()
+            ),
+        )),
+    }
 }
 
 fn build(args: BuildArgs) -> Result<(), Failure> {
     if let Some(threads) = args.threads {
-        rayon::ThreadPoolBuilder::new().num_threads(threads).build_global()?;
+        rayon::ThreadPoolBuilder::new().num_threads(threads.into()).build_global()?;
     }
     let options = hierarchy::Options {
         scene: scene_name(args.scene, &args.output)?,
@@ -261,9 +288,9 @@ fn build(args: BuildArgs) -> Result<(), Failure> {
         .map_err(|e| refuse_build(&args.sources, &e))?;
     let mut out = std::io::stdout().lock();
     if args.json {
-        writeln!(out, "{}", serde_json::to_string_pretty(&report)?)?;
+        shown(writeln!(out, "{}", serde_json::to_string_pretty(&report)?))?;
     } else {
-        print_report(&mut out, &args.output, &report)?;
+        shown(print_report(&mut out, &args.output, &report))?;
     }
     Ok(())
 }
@@ -298,6 +325,7 @@ fn refuse_build(sources: &[PathBuf], error: &BuildError) -> Failure {
         BuildError::MaxError { .. }
             | BuildError::Quantum(_)
             | BuildError::Memory { .. }
+            | BuildError::Store(StoreError::Foreign { .. })
             | BuildError::Ingest(IngestError::Options { .. })
     );
     // What the heights themselves are to blame for names where they came from.
@@ -364,20 +392,28 @@ fn print_report(out: &mut impl Write, store: &Path, report: &Report) -> std::io:
 fn serve(stores: &[PathBuf], listen: SocketAddr) -> Result<(), Failure> {
     let server = http::Server::open(stores, listen)?;
     let mut out = std::io::stdout().lock();
-    writeln!(out, "Serving {} at {}", server.scenes().join(", "), server.address())?;
-    out.flush()?;
+    let printed = writeln!(out, "Serving {} at {}", server.scenes().join(", "), server.address());
+    shown(printed.and_then(|()| out.flush()))?;
     drop(out);
     Ok(server.run_until_signal()?)
 }
 
 fn inspect_store(args: &InspectArgs) -> Result<(), Failure> {
-    let store = Store::open(&args.store)?;
+    let store = Arc::new(Store::open(&args.store)?);
     let inspection = inspect::inspect(&store, args.verify)?;
     let mut out = std::io::stdout().lock();
+    if let Some(path) = &args.curve {
+        if path.as_os_str() == "-" {
+            return Ok(curve::write(&store, &mut out)??);
+        }
+        let unwritten = |e: std::io::Error| Failure(1, format!("{}: cannot write: {e}", path.display()));
+        let mut file = std::fs::File::create(path).map_err(unwritten)?;
+        curve::write(&store, &mut file)?.map_err(unwritten)?;
+    }
     if args.json {
-        writeln!(out, "{}", serde_json::to_string_pretty(&inspection)?)?;
+        shown(writeln!(out, "{}", serde_json::to_string_pretty(&inspection)?))?;
     } else {
-        print_inspection(&mut out, &inspection)?;
+        shown(print_inspection(&mut out, &inspection))?;
     }
     Ok(())
 }

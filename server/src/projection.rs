@@ -48,7 +48,6 @@ pub fn epsg(code: u32) -> Option<&'static str> {
 pub struct Projection {
     kind: Kind,
     lonlat: Proj,
-    metres_per_unit: f64,
 }
 
 enum Kind {
@@ -81,13 +80,7 @@ impl Projection {
         };
         let lonlat =
             Proj::from_proj_string("+proj=longlat +datum=WGS84").map_err(|e| failed(e.to_string()))?;
-        Ok(Self { kind, lonlat, metres_per_unit: unit_metres(proj4) })
-    }
-
-    /// Metres in one unit of x and y (1 for geographic CRSs, whose unit is the degree).
-    #[must_use]
-    pub fn metres_per_unit(&self) -> f64 {
-        self.metres_per_unit
+        Ok(Self { kind, lonlat })
     }
 
     /// True when x and y are degrees of longitude and latitude.
@@ -180,7 +173,21 @@ fn rewritten(proj4: &str) -> String {
     words.collect::<Vec<_>>().join(" ")
 }
 
-fn unit_metres(proj4: &str) -> f64 {
+/// Metres in one unit of height, where a PROJ string (of a compound CRS) says it.
+#[must_use]
+pub fn vertical_metres(proj4: &str) -> Option<f64> {
+    match parameter(proj4, "vunits")? {
+        "m" => Some(1.0),
+        "ft" => Some(0.3048),
+        "us-ft" => Some(1200.0 / 3937.0),
+        _ => None,
+    }
+}
+
+/// Metres in one unit of x and y of a PROJ string, whether or not its projection is built in; 1 where it says
+/// none.
+#[must_use]
+pub fn unit_metres(proj4: &str) -> f64 {
     let given = parameter(proj4, "to_meter").and_then(|v| match v.split_once('/') {
         Some((n, d)) => Some(n.parse::<f64>().ok()? / d.parse::<f64>().ok()?),
         None => v.parse().ok(),

@@ -134,7 +134,10 @@ pub fn place(east: f64, north: f64, samples: u32) -> [f64; 2] {
 /// # Errors
 /// When the file cannot be written.
 pub fn write(path: &Path, samples: u32) -> Result<(), String> {
-    let failed = |e: &dyn std::fmt::Display| format!("{}: cannot write the sample DEM: {e}", path.display());
+    let failed = |e: &dyn std::fmt::Display| {
+        let path = path.display();
+        format!("{path}: cannot write the sample DEM: {e}; free some space or choose another --folder")
+    };
     let file = BufWriter::new(File::create(path).map_err(|e| failed(&e))?);
     let mut encoder = TiffEncoder::new(file).map_err(|e| failed(&e))?;
     let mut image = encoder.new_image::<colortype::Gray32Float>(samples, samples).map_err(|e| failed(&e))?;

@@ -42,7 +42,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use xxhash_rust::xxh3::xxh3_64;
 
 /// The format that this build writes, and the only one that it reads.
-pub const FORMAT: u32 = 1;
+pub const FORMAT: u32 = 2;
 
 /// A pack is closed once it holds this many bytes.
 const PACK_BYTES: u64 = 32 << 20;
@@ -57,6 +57,7 @@ const MAGIC: &[u8; 8] = b"DMTDIR01";
 const ENTRY_BYTES: usize = 32;
 const SCENE_FILE: &str = "scene.json";
 const WORK_FOLDER: &str = ".building";
+const LOCK_FILE: &str = ".lock";
 /// The work folder while it is being removed.
 const GONE_FOLDER: &str = ".building-gone";
 
@@ -86,7 +87,7 @@ pub enum Kind {
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     /// The file system said no.
-    #[error("{path}: cannot {action}: {error}{}", remedy(error))]
+    #[error("{path}: cannot {action}: {error}; {}", remedy(action, error))]
     Io {
         /// What was being done.
         action: &'static str,
@@ -103,6 +104,16 @@ pub enum StoreError {
     /// Another build holds the lock.
     #[error("{0}: another build is writing this store: wait for it, or choose another folder with -o")]
     Busy(PathBuf),
+    /// The folder holds what no build left there.
+    #[error(
+        "{path}: expected an empty folder or a store, found '{found}' in it: choose another folder with -o"
+    )]
+    Foreign {
+        /// The folder.
+        path: PathBuf,
+        /// The first of what is in it.
+        found: String,
+    },
     /// What an interrupted build left is not what it wrote.
     #[error(
         "{path}: damaged since it was written ({key:?} does not match its checksum): build again with --fresh"
@@ -131,15 +142,41 @@ pub enum StoreError {
     },
 }
 
-fn remedy(error: &io::Error) -> &'static str {
+fn remedy(action: &str, error: &io::Error) -> &'static str {
     match error.kind() {
         io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
-            "; free some space and build again: the same command goes on where this one ended (the old scene, if any, is untouched)"
+            "free some space and build again: the same command goes on where this one ended (the old scene, if any, is untouched)"
         }
-        io::ErrorKind::PermissionDenied => "; choose a folder that you may write to",
-        io::ErrorKind::ReadOnlyFilesystem => "; choose a folder on a disk that can be written",
-        _ => "",
+        io::ErrorKind::ReadOnlyFilesystem => "choose a folder on a disk that can be written",
+        kind if matches!(action, "open" | "read") => match kind {
+            io::ErrorKind::PermissionDenied => "ask for the right to read it",
+            _ => "build the store again, or copy it again from where it is intact",
+        },
+        io::ErrorKind::PermissionDenied => "choose a folder that you may write to",
+        _ => "check the disk, or choose another folder with -o (the old scene, if any, is untouched)",
     }
+}
+
+/// The first thing in a folder that neither a build nor the making of a file system left there, unless the
+/// folder is a store already.
+fn foreign(root: &Path) -> Option<String> {
+    // What cannot be looked into cannot be made a store either: that is said when it is tried.
+    let names =
+        fs::read_dir(root).ok()?.filter_map(|e| Some(e.ok()?.file_name().to_string_lossy().into_owned()));
+    let mut names: Vec<String> = names.collect();
+    names.sort();
+    // A store is one whatever else its owner keeps in it.
+    if matches!(Manifest::read(root), Ok(_) | Err(StoreError::Format { .. })) {
+        return None;
+    }
+    let built_here = names.iter().any(|name| name == LOCK_FILE);
+    let is_version = |name: &str| name.len() == 16 && name.bytes().all(|b| b.is_ascii_hexdigit());
+    names.into_iter().find(|name| match name.as_str() {
+        LOCK_FILE | WORK_FOLDER | "lost+found" => false,
+        // A damaged description, and versions whose build was killed before it was there.
+        SCENE_FILE => !built_here,
+        other => !(built_here && is_version(other)),
+    })
 }
 
 fn io_at<'a>(action: &'static str, path: &'a Path) -> impl Fn(io::Error) -> StoreError + 'a {
@@ -273,8 +310,11 @@ impl Writer {
     /// # Errors
     /// When another build is at work there or the folder cannot be written.
     pub fn create(root: &Path) -> Result<Self, StoreError> {
+        if let Some(found) = foreign(root) {
+            return Err(StoreError::Foreign { path: root.to_owned(), found });
+        }
         fs::create_dir_all(root).map_err(io_at("create the folder", root))?;
-        let lock_path = root.join(".lock");
+        let lock_path = root.join(LOCK_FILE);
         let lock = File::options()
             .create(true)
             .append(true)

@@ -21,7 +21,7 @@ mod tests;
 
 pub use offscreen::Offscreen;
 
-use crate::camera::{Bounds, Camera};
+use crate::camera::{Camera, nearest_drawn};
 use crate::drawing::DrawItem;
 use diamantina_protocol::message::{Layer, Scene};
 use frame::{FrameUniform, LayerUniform, Reference, single};
@@ -38,9 +38,6 @@ const DEPTH: wgpu::TextureFormat = wgpu::TextureFormat::Depth32Float;
 
 /// Bytes from one layer's uniforms to the next: the largest alignment that WebGPU and WebGL2 ask for.
 const LAYER_STRIDE: usize = 256;
-
-/// The nearest that the near plane comes to the eye, in metres, unless cells are smaller.
-const NEAR_MIN: f64 = 0.05;
 
 /// The farthest that the near plane goes, in metres, whatever lies beyond.
 const NEAR_MAX: f64 = 1e6;
@@ -189,7 +186,10 @@ pub enum RenderError {
     )]
     NoAdapter(String),
     /// The adapter refused.
-    #[error("the graphics adapter gives no device: {0}")]
+    #[error(
+        "the graphics adapter gives no device: {0}: update its driver, or use a software one, for example \
+         mesa-vulkan-drivers of Debian"
+    )]
     Device(String),
     /// A size that cannot be drawn.
     #[error("picture of {} x {} pixels: expected 1 to {limit} each way", found[0], found[1])]
@@ -200,14 +200,8 @@ pub enum RenderError {
         limit: u32,
     },
     /// The picture was drawn but did not come back.
-    #[error("the picture could not be read back from the graphics adapter: {0}")]
+    #[error("the picture could not be read back from the graphics adapter: {0}: ask for a smaller --size")]
     Read(String),
-}
-
-/// A box with its heights multiplied.
-fn stretched(bounds: Bounds, exaggeration: f64) -> Bounds {
-    let by = DVec3::new(1.0, 1.0, exaggeration);
-    Bounds { min: bounds.min * by, max: bounds.max * by }
 }
 
 /// A diamond's place, as the vertex shader takes it.
@@ -364,7 +358,7 @@ impl Renderer {
             .iter()
             .filter_map(|item| {
                 let resident = self.residents.get(item)?;
-                let bounds = resident.bounds.map(|b| stretched(b, exaggeration));
+                let bounds = resident.bounds.map(|b| b.stretched(exaggeration));
                 let bounds = bounds.filter(|b| b.touches(&planes))?;
                 let upper = layers.get(item.layer)?.forest.local(item.diamond).upper;
                 let sides = item.sides & if upper { 0b1111 } else { 0b0011 };
@@ -382,8 +376,7 @@ impl Renderer {
     fn write_uniforms(&mut self, layers: &[Layer], camera: &Camera, look: &Look, draws: &[Draw<'_>]) {
         let nearest = draws.iter().map(|d| d.distance).fold(NEAR_MAX, f64::min);
         // A little before the nearest box: rounding must not cut it.
-        let cells = layers.iter().flat_map(|layer| layer.cell);
-        let near = single((0.9 * nearest).max(cells.fold(NEAR_MIN, f64::min)));
+        let near = single((0.9 * nearest).max(nearest_drawn(layers.iter().flat_map(|layer| layer.cell))));
         let frame = FrameUniform::new(camera, look, near, !self.options.format.is_srgb());
         self.queue.write_buffer(&self.frame_uniform, 0, bytemuck::bytes_of(&frame));
 

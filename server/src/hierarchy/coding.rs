@@ -17,7 +17,7 @@ use crate::canvas::Canvas;
 use crate::store::{Key, Kind as BlobKind};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::{Block, Diamond};
-use diamantina_protocol::points::{self, STEP_MAX};
+use diamantina_protocol::points::{self, Coding, Rule, STEP_MAX};
 use std::io;
 
 /// 2E+1 quanta for the whole number of quanta E that keeps every height within the asked error.
@@ -30,9 +30,56 @@ pub(super) fn fine_step(max_error: f64, stats: &Stats) -> Result<u32, BuildError
     Err(BuildError::MaxError { asked: max_error, limit: limit * stats.quantum, quantum: stats.quantum })
 }
 
+/// Diamonds of the finest level from which the model is learnt, with all their ancestors. More than 24 gain
+/// less than 0.1 %; with 8 a store is 1 % larger, where steps are large 7 %.
+const MODEL_SAMPLES: usize = 24;
+
+/// How the layer is coded: its steps, and a model learnt from a spread of its diamonds.
+pub(super) fn coding(plan: &Plan, canvas: &Canvas, rule: Rule, fine_step: u32) -> Result<Coding, BuildError> {
+    let work = |error: io::Error| BuildError::Work { path: canvas.folder().to_owned(), error };
+    let coding = Coding::new(rule, fine_step, exponents(plan, canvas, fine_step).map_err(work)?)?;
+    let forest = &plan.forest;
+    // Coarse levels are all read from one window, finer ones each from its own.
+    let chunk_level = plan.chunks.level();
+    let coarse = canvas.read(plan.spacing_log2(chunk_level), [0, 0], forest.size()).map_err(work)?;
+    let source = |d: Diamond| -> io::Result<Block> {
+        let mut block = Block::empty(forest);
+        let local = forest.local(d);
+        if d.level() < chunk_level {
+            block.fill(&local, |x, y| coarse.at(x, y));
+        } else {
+            let [low, high] = forest.bounds(d);
+            let window = canvas.read(plan.spacing_log2(d.level() + 1), low, high)?;
+            block.fill(&local, |x, y| window.at(x, y));
+        }
+        Ok(block)
+    };
+    let finest: Vec<Diamond> = forest.diamonds(forest.levels() - 1).collect();
+    let mut samples = Vec::with_capacity(MODEL_SAMPLES);
+    // Four candidates a sample: those with the most heights are taken, since nodata teaches nothing.
+    for group in spread(&finest, 4 * MODEL_SAMPLES).chunks(4) {
+        let mut fullest = None;
+        for d in group {
+            let valid = source(*d).map_err(work)?.heights().iter().filter(|h| **h != NODATA).count();
+            if valid > fullest.map_or(0, |(most, _)| most) {
+                fullest = Some((valid, *d));
+            }
+        }
+        samples.extend(fullest.map(|(_, d)| d));
+    }
+    let model = points::train(forest, &coding, &samples, source).map_err(work)?;
+    Ok(coding.with_model(model))
+}
+
+/// Up to `count` of a list, evenly spread over it.
+fn spread(list: &[Diamond], count: usize) -> Vec<Diamond> {
+    let count = count.min(list.len());
+    (0..count).map(|i| list[i * list.len() / count]).collect()
+}
+
 /// A step for each level: about what the next finer level would add anyway, so that coarse views do not
 /// pay for a precision that they cannot show.
-pub(super) fn exponents(plan: &Plan, canvas: &Canvas, fine_step: u32) -> io::Result<Vec<u8>> {
+fn exponents(plan: &Plan, canvas: &Canvas, fine_step: u32) -> io::Result<Vec<u8>> {
     let forest = &plan.forest;
     let details: Vec<f64> =
         (0..forest.levels()).map(|level| detail(plan, canvas, level)).collect::<io::Result<_>>()?;

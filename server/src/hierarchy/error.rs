@@ -1,5 +1,6 @@
 //! Why a scene could not be built: the file, what was expected, what was found and what to do.
 
+use super::transcribe::HEIGHT_METRES_MAX;
 use crate::ingest::IngestError;
 use crate::store::StoreError;
 use diamantina_protocol::bintree::ForestError;
@@ -17,7 +18,7 @@ pub enum BuildError {
     #[error(transparent)]
     Store(#[from] StoreError),
     /// The working files could not be written.
-    #[error("{path}: cannot write the working files: {error}{}", work_remedy(error))]
+    #[error("{path}: cannot write the working files: {error}; {}", work_remedy(error))]
     Work {
         /// The work folder.
         path: PathBuf,
@@ -40,7 +41,7 @@ pub enum BuildError {
     )]
     AllNodata(u64),
     /// Heights do not fit in the integers of the format.
-    #[error("height {value} is {} quanta of {quantum} m, beyond {SOURCE_MAX}: give a larger --quantum", (value / quantum).round())]
+    #[error("height {value} is {} quanta of {quantum} m, beyond {SOURCE_MAX}: if it stands for nodata, say --nodata; else give a larger --quantum", (value / quantum).round())]
     Range {
         /// Metres.
         value: f64,
@@ -48,7 +49,7 @@ pub enum BuildError {
         quantum: f64,
     },
     /// The quantum makes no sense.
-    #[error("--quantum {0}: expected metres above 0")]
+    #[error("--quantum {0}: expected metres above 0 and below {HEIGHT_METRES_MAX}")]
     Quantum(f64),
     /// The asked error is out of range.
     #[error("--max-error {asked}: expected 0 to {limit} m for a quantum of {quantum} m")]
@@ -61,7 +62,9 @@ pub enum BuildError {
         quantum: f64,
     },
     /// Too large, or too thin, for a forest.
-    #[error("the source has {width} x {height} samples: {error}")]
+    #[error(
+        "the source has {width} x {height} samples: {error}; cut it into pieces and build a store of each"
+    )]
     Forest {
         /// Samples along x.
         width: u32,
@@ -74,7 +77,7 @@ pub enum BuildError {
     #[error("steps: {0}")]
     Coding(#[from] CodingError),
     /// The memory asked for is too little.
-    #[error("--memory {asked} bytes: this source needs at least {needed}")]
+    #[error("--memory {}: too little for this source: say --memory {} or more", mebibytes(*asked), mebibytes(*needed))]
     Memory {
         /// Bytes asked.
         asked: u64,
@@ -83,13 +86,18 @@ pub enum BuildError {
     },
 }
 
+/// Bytes as the command line takes them, rounded up.
+fn mebibytes(bytes: u64) -> String {
+    format!("{}MiB", bytes.div_ceil(1 << 20))
+}
+
 fn work_remedy(error: &io::Error) -> &'static str {
     match error.kind() {
         io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
-            "; free some space (16/3 bytes a sample) and build again: the same command goes on where this one \
+            "free some space (16/3 bytes a sample) and build again: the same command goes on where this one \
              ended (the old scene, if any, is untouched)"
         }
-        _ => "",
+        _ => "check the disk, or choose another folder with -o",
     }
 }
 

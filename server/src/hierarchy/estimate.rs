@@ -11,7 +11,7 @@
     reason = "estimates are rounded, and sides of tiles are below 2^9"
 )]
 
-use super::coding::{exponents, fine_step};
+use super::coding::{coding, fine_step};
 use super::journal::Journal;
 use super::plan::Plan;
 use super::tallies::Tallies;
@@ -25,7 +25,7 @@ use crate::store::Writer;
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
-use diamantina_protocol::points::{self, Coding};
+use diamantina_protocol::points;
 use rayon::prelude::*;
 use std::collections::HashSet;
 use std::sync::Mutex;
@@ -245,8 +245,7 @@ fn build_tile(tile: &Tile, grid: &Grid, options: &Options) -> Result<(Levels, Du
     let canvas = Canvas::create(writer.work_folder(), width, height, plan.coarsest()).map_err(&failed)?;
     canvas.write_rows(0, &tile.heights).map_err(&failed)?;
     let fine_step = fine_step(options.max_error, &tile.stats)?;
-    let exponents = exponents(&plan, &canvas, fine_step).map_err(&failed)?;
-    let coding = Coding::new(options.rule, fine_step, exponents)?;
+    let coding = coding(&plan, &canvas, options.rule, fine_step)?;
     let progress = Progress::hidden();
     let journal = Journal::create(writer.work_folder(), &[0; 32], Duration::MAX).map_err(&failed)?;
     let work = Work { writer: &writer, journal, progress: &progress, chunks: 1 };

@@ -30,7 +30,7 @@ use crate::canvas::Canvas;
 use crate::ingest::{Grid, Source};
 use crate::progress::Progress;
 use crate::store::Writer;
-use coding::{exponents, fine_step};
+use coding::fine_step;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::message::{Crs, Frame, Kind, Scene};
 use diamantina_protocol::points::{Coding, Rule};
@@ -155,8 +155,7 @@ fn run(
     let (work, canvas, before) = work::open(writer, &plan, grid, &fingerprint, options, progress)?;
     let stats = transcribe(source, &plan, &canvas, quantum, &before.bands, &work)?;
     let fine_step = fine_step(options.max_error, &stats)?;
-    let exponents = exponents(&plan, &canvas, fine_step).map_err(work.failure())?;
-    let coding = Coding::new(options.rule, fine_step, exponents)?;
+    let coding = coding::coding(&plan, &canvas, options.rule, fine_step)?;
     let build = Build {
         plan,
         canvas,

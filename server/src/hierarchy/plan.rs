@@ -41,20 +41,24 @@ impl Plan {
         let [w, h] = forest.size().map(u64::from);
         let threads = rayon::current_num_threads() as u64;
         // Chunks of 1024 cells, or larger where the coarse levels would otherwise not fit.
-        let mut chunk_log2 = 10.max(forest.patch_log2() + 2).min(forest.root_log2());
+        let chunk_logs = 10.max(forest.patch_log2() + 2).min(forest.root_log2())..=forest.root_log2();
         let coarse_bytes = |chunk_log2: u32| {
             let spacing = chunk_log2 - forest.patch_log2();
             ((w >> spacing) + 1) * ((h >> spacing) + 1) * COARSE_POINT_BYTES
         };
-        while coarse_bytes(chunk_log2) > memory / 4 && chunk_log2 < forest.root_log2() {
-            chunk_log2 += 1;
-        }
-        let chunk_bytes = CHUNK_CELL_BYTES << (2 * chunk_log2);
-        let always = BASE_BYTES + coarse_bytes(chunk_log2) + places_of_all(&forest) * DIAMOND_BYTES;
-        let needed = always + chunk_bytes;
-        if needed > memory {
-            return Err(BuildError::Memory { asked: memory, needed });
-        }
+        let chunk_bytes = |chunk_log2: u32| CHUNK_CELL_BYTES << (2 * chunk_log2);
+        let always =
+            |chunk_log2: u32| BASE_BYTES + coarse_bytes(chunk_log2) + places_of_all(&forest) * DIAMOND_BYTES;
+        let needed = |chunk_log2: u32| {
+            // The coarse levels should take no more than a quarter, where larger chunks could still help.
+            let share = if chunk_log2 < forest.root_log2() { 4 } else { 1 };
+            (always(chunk_log2) + chunk_bytes(chunk_log2)).max(share * coarse_bytes(chunk_log2))
+        };
+        let Some(chunk_log2) = chunk_logs.clone().find(|log2| needed(*log2) <= memory) else {
+            let least = chunk_logs.map(needed).min().unwrap_or(u64::MAX);
+            return Err(BuildError::Memory { asked: memory, needed: least });
+        };
+        let (always, chunk_bytes) = (always(chunk_log2), chunk_bytes(chunk_log2));
         let workers = ((memory - always) / chunk_bytes).clamp(1, threads);
         let chunks = Chunks::new(forest, chunk_log2);
         Ok(Self {

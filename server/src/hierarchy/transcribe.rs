@@ -28,6 +28,9 @@ pub(super) struct Stats {
     pub(super) rounding: f64,
 }
 
+/// Heights are below this, in metres: a client refuses what is more.
+pub(super) const HEIGHT_METRES_MAX: f64 = 1e12;
+
 /// The greatest power of ten at or below `value`.
 fn power_of_ten(value: f64) -> f64 {
     let exponent = value.log10().floor() as i32;
@@ -41,7 +44,7 @@ pub(super) fn find_quantum(source: &Source, options: &Options) -> Result<f64, Bu
     let grid = source.grid();
     let scale = grid.height_scale.abs();
     if let Some(quantum) = options.quantum {
-        return if quantum > 0.0 && quantum.is_finite() {
+        return if quantum > 0.0 && quantum < HEIGHT_METRES_MAX {
             Ok(quantum)
         } else {
             Err(BuildError::Quantum(quantum))
@@ -79,7 +82,22 @@ pub(super) fn find_quantum(source: &Source, options: &Options) -> Result<f64, Bu
         Some(step) if options.max_error == 0.0 || step <= options.max_error => step,
         _ => fine.max(asked),
     };
-    Ok(quantum.max(power_of_ten(largest / f64::from(SOURCE_MAX)) * 10.0))
+    let least = power_of_ten(largest / f64::from(SOURCE_MAX)) * 10.0;
+    if least > quantum && (largest >= HEIGHT_METRES_MAX || is_outlier(&mut heights, least)) {
+        let value = if low.abs() > high.abs() { low } else { high };
+        return Err(BuildError::Range { value, quantum });
+    }
+    Ok(quantum.max(least))
+}
+
+/// Whether a quantum that is due to the largest height is too coarse for the heights without their extremes:
+/// then these are no heights, but nodata that nobody declared.
+fn is_outlier(heights: &mut Vec<f64>, quantum: f64) -> bool {
+    heights.sort_by(f64::total_cmp);
+    heights.dedup();
+    let aside = (heights.len() / 100).max(1);
+    let rest = heights.get(aside..heights.len().saturating_sub(aside)).unwrap_or_default();
+    rest.first().zip(rest.last()).is_some_and(|(low, high)| high - low < 256.0 * quantum)
 }
 
 /// Reads the source into the canvas, but for the rows of `done`, and says what all rows hold.
@@ -135,6 +153,7 @@ pub(super) fn transcribe(
     if stats.valid == 0 {
         return Err(BuildError::AllNodata(width * u64::from(grid.height)));
     }
+    source.check_nodata()?;
     Ok(stats)
 }
 

@@ -1,5 +1,4 @@
-//! Arc/Info ASCII grid (`.asc`), plain or as the only grid in a zip: a header of keywords, then
-//! width x height numbers from the north-west, lines wrapped anywhere.
+//! Arc/Info ASCII grid (`.asc`): a header of keywords, then width x height numbers from the north-west, lines wrapped anywhere.
 //!
 //! | keyword | value |
 //! |---|---|
@@ -15,7 +14,7 @@ use std::fs::File;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 
-use super::error::{Result, broken, io_error, unsupported};
+use super::error::{Result, broken, io_error};
 use super::raster::{Dtype, Place, Raster, SIDE_MAX, Samples};
 use super::samples::{Order, Transcript};
 
@@ -25,32 +24,6 @@ const REMEDY: &str = "fetch the file again or correct it";
 
 pub(super) fn open(path: &Path, file: File) -> Result<Raster> {
     read(path, BufReader::with_capacity(1 << 16, file))
-}
-
-/// The only grid of a zip archive.
-pub(super) fn open_zip(path: &Path, file: File) -> Result<Raster> {
-    let failed = |e: zip::result::ZipError| {
-        broken(
-            path,
-            "a readable zip archive",
-            e.to_string(),
-            "fetch it again, or unzip it and give the grid itself",
-        )
-    };
-    let mut archive = zip::ZipArchive::new(BufReader::new(file)).map_err(failed)?;
-    // Names that are not text cannot end in ".asc" either.
-    let names = archive.file_names().filter_map(|name| Some(name.ok()?.into_owned()));
-    let grids: Vec<String> = names.filter(|name| name.to_lowercase().ends_with(".asc")).collect();
-    let [name] = &grids[..] else {
-        return Err(unsupported(
-            path,
-            "exactly one .asc grid in the archive",
-            format!("{} among {} files", grids.len(), archive.len()),
-            "unzip it and give the grids themselves",
-        ));
-    };
-    let entry = archive.by_name(name).map_err(failed)?;
-    read(path, BufReader::with_capacity(1 << 16, entry))
 }
 
 #[derive(Default)]
@@ -104,6 +77,7 @@ fn read(path: &Path, input: impl BufRead) -> Result<Raster> {
         integer,
         height_scale: 1.0,
         height_offset: 0.0,
+        height_doubt: None,
         nodata: header.nodata,
         samples: Samples::File(samples),
     })

@@ -58,7 +58,7 @@ pub enum IngestError {
     },
     /// Two files do not lie on one grid.
     #[error("{} and {}: expected one grid, {expected}, found {found}: reproject or crop one of them, or build \
-             them as separate layers", first.display(), second.display())]
+             each into a store of its own", first.display(), second.display())]
     Mosaic {
         /// The first file.
         first: PathBuf,

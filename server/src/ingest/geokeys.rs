@@ -7,9 +7,10 @@ use std::collections::HashMap;
 use std::fmt::Write;
 use std::path::Path;
 
-use super::error::{Result, unsupported};
+use super::error::unsupported;
 use super::raster::SourceCrs;
 use super::tiff_header::{Header, VALUES_MAX};
+use super::units::{Vertical, linear_metres, vertical};
 use crate::projection;
 
 const USER_DEFINED: u64 = 32767;
@@ -19,9 +20,12 @@ pub(super) struct GeoKeys {
     pub(super) crs: Option<SourceCrs>,
     /// True when the tie point is a sample, not the corner of a cell.
     pub(super) sample_is_point: bool,
-    /// Metres in one unit of height, where the file says it.
-    pub(super) vertical_metres: Option<f64>,
+    /// Metres in one unit of height, where the file says it; or what it says, where that is unclear.
+    pub(super) vertical_metres: Option<Result<f64, String>>,
 }
+
+/// Geographic systems of the EPSG's whose unit is the grad.
+const GRADS: [u32; 8] = [4807, 4810, 4811, 4816, 4819, 4821, 4901, 4902];
 
 struct Keys {
     shorts: HashMap<u64, u64>,
@@ -30,18 +34,18 @@ struct Keys {
 }
 
 impl GeoKeys {
-    pub(super) fn read(path: &Path, header: &Header<'_>) -> Result<Self> {
+    pub(super) fn read(path: &Path, header: &Header<'_>) -> super::error::Result<Self> {
         let keys = Keys::read(header)?;
         Ok(Self {
             crs: keys.crs(path)?,
             sample_is_point: keys.short(1025) == Some(2),
-            vertical_metres: keys.short(4099).and_then(linear_metres),
+            vertical_metres: keys.vertical(),
         })
     }
 }
 
 impl Keys {
-    fn read(header: &Header<'_>) -> Result<Self> {
+    fn read(header: &Header<'_>) -> super::error::Result<Self> {
         let directory = header.integers(34735, VALUES_MAX)?;
         let doubles = header.reals(34736, VALUES_MAX)?;
         let text = header.text(34737)?.unwrap_or_default();
@@ -81,7 +85,34 @@ impl Keys {
         u32::try_from(value).ok()
     }
 
-    fn crs(&self, path: &Path) -> Result<Option<SourceCrs>> {
+    /// Metres in one unit of height: said by a unit, a vertical CRS, or a compound one in the place of a plain.
+    fn vertical(&self) -> Option<Result<f64, String>> {
+        let code = self.code(4096);
+        let counts = code.map(|code| (code, vertical(code)));
+        if let Some((code, Some(Vertical::Depths))) = counts {
+            return Some(Err(format!("depths, which grow downwards (vertical CRS EPSG:{code})")));
+        }
+        if let Some(unit) = self.code(4099) {
+            return Some(
+                linear_metres(unit).ok_or(format!("heights in unit EPSG:{unit}, which is not known")),
+            );
+        }
+        match counts {
+            Some((_, Some(Vertical::Heights(metres)))) => return Some(Ok(metres)),
+            // GDAL writes a geographic system with heights above the ellipsoid here: they are in metres.
+            Some((code, _)) if projection::epsg(code).is_some_and(|text| text.contains("+proj=longlat")) => {
+                return Some(Ok(1.0));
+            }
+            Some((code, _)) => {
+                return Some(Err(format!("heights in vertical CRS EPSG:{code}, whose unit is not known")));
+            }
+            None => {}
+        }
+        let compound = [3072, 2048].into_iter().find_map(|key| projection::epsg(self.code(key)?));
+        compound.and_then(projection::vertical_metres).map(Ok)
+    }
+
+    fn crs(&self, path: &Path) -> super::error::Result<Option<SourceCrs>> {
         let projected = self.short(3072).is_some() && self.short(1024) != Some(2);
         let geographic = self.short(2048).is_some();
         if self.short(1024) == Some(3) {
@@ -93,11 +124,12 @@ impl Keys {
             ));
         }
         if projected {
-            return Ok(Some(self.projected()));
+            return self.projected(path).map(Some);
         }
         if !geographic {
             return Ok(None);
         }
+        self.check_degrees(path)?;
         Ok(Some(match self.code(2048) {
             Some(code) => SourceCrs::epsg(code, true),
             None => SourceCrs::new(
@@ -108,10 +140,41 @@ impl Keys {
         }))
     }
 
-    fn projected(&self) -> SourceCrs {
-        let unit = match self.short(3076) {
+    /// Refuses longitudes and latitudes that are not in degrees.
+    fn check_degrees(&self, path: &Path) -> super::error::Result<()> {
+        let grads = self.code(2048).is_some_and(|code| GRADS.contains(&code));
+        let found = match self.short(2054) {
+            Some(9102 | 9107 | 9108 | 9122) => return Ok(()),
+            // Radians in one unit; without the number there is nothing to judge by.
+            Some(USER_DEFINED)
+                if self.double(2055).is_none_or(|u| (u / 1f64.to_radians() - 1.0).abs() < 1e-6) =>
+            {
+                return Ok(());
+            }
+            Some(USER_DEFINED) => "a unit of its own".to_owned(),
+            Some(code) if code != 0 => format!("angles in unit EPSG:{code}"),
+            _ if grads => "a CRS whose unit is the grad".to_owned(),
+            _ => return Ok(()),
+        };
+        Err(unsupported(
+            path,
+            "longitudes and latitudes in degrees",
+            found,
+            "reproject it, for instance with gdalwarp -t_srs EPSG:4326",
+        ))
+    }
+
+    fn projected(&self, path: &Path) -> super::error::Result<SourceCrs> {
+        let unit = match self.short(3076).filter(|code| !matches!(code, 0 | 65535)) {
             Some(USER_DEFINED) => self.double(3077),
-            Some(code) => linear_metres(code),
+            Some(code) => Some(u32::try_from(code).ok().and_then(linear_metres).ok_or_else(|| {
+                unsupported(
+                    path,
+                    "coordinates in a unit known here, such as metres or feet",
+                    format!("unit EPSG:{code}"),
+                    "reproject it, for instance with gdalwarp -t_srs and a CRS in metres",
+                )
+            })?),
             None => None,
         }
         .filter(|m| *m > 0.0);
@@ -134,7 +197,7 @@ impl Keys {
             }
             crs.metres_per_unit = metres;
         }
-        crs
+        Ok(crs)
     }
 
     /// The first citation that says something.
@@ -202,18 +265,4 @@ impl Keys {
         };
         Some(format!("{method} +x_0={x} +y_0={y}"))
     }
-}
-
-/// Metres in a linear unit of measure, by its EPSG code.
-fn linear_metres(code: u64) -> Option<f64> {
-    Some(match code {
-        9001 => 1.0,
-        9002 => 0.3048,
-        9003 => 1200.0 / 3937.0,
-        9005 => 0.304_797_265_4,
-        9030 => 1852.0,
-        9036 => 1000.0,
-        9096 => 0.9144,
-        _ => return None,
-    })
 }

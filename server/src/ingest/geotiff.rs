@@ -18,6 +18,7 @@ use super::geokeys::GeoKeys;
 use super::raster::{Dtype, Place, Raster, SIDE_MAX, Samples, Window};
 use super::samples::decode;
 use super::tiff_header::{CHUNKS_MAX, Header};
+use super::units::named_metres;
 
 /// Decoded bytes of one strip or tile, at most: a tile of 8192 x 8192 floats.
 const CHUNK_BYTES_MAX: u64 = 256 << 20;
@@ -80,6 +81,14 @@ pub(super) fn open(path: &Path, file: File, cache: Arc<ChunkCache>, id: u32) -> 
     check_method(path, compression, predictor)?;
     let compressed = compression != 1 || predictor != 1;
     let places = places(path, &header, layout, dtype, compressed)?;
+    if header.has_mask() {
+        return Err(unsupported(
+            path,
+            "nodata as a value of the samples",
+            "a mask of valid samples beside them",
+            "write the mask into them, for instance with gdalwarp -dstnodata -32768",
+        ));
+    }
     let keys = GeoKeys::read(path, &header)?;
     let place = place(path, &header, layout, &keys)?;
     let nodata = match header.text(42113)?.filter(|t| !t.is_empty()) {
@@ -112,7 +121,8 @@ pub(super) fn open(path: &Path, file: File, cache: Arc<ChunkCache>, id: u32) -> 
         let decoder = chunks.decoder(path)?;
         chunks.keep(decoder);
     }
-    let vertical = metadata.unit_metres.or(keys.vertical_metres).unwrap_or(1.0);
+    let vertical = metadata.unit_metres.or(keys.vertical_metres).unwrap_or(Ok(1.0));
+    let metres = *vertical.as_ref().unwrap_or(&1.0);
     Ok(Raster {
         file: path.to_owned(),
         width: layout.width,
@@ -120,8 +130,9 @@ pub(super) fn open(path: &Path, file: File, cache: Arc<ChunkCache>, id: u32) -> 
         place,
         dtype,
         integer: dtype.is_integer(),
-        height_scale: metadata.scale * vertical,
-        height_offset: metadata.offset * vertical,
+        height_scale: metadata.scale * metres,
+        height_offset: metadata.offset * metres,
+        height_doubt: vertical.err(),
         nodata,
         samples: Samples::Tiff(chunks),
     })
@@ -142,7 +153,7 @@ fn layout(path: &Path, header: &Header<'_>) -> Result<Layout> {
             path,
             "one band of heights",
             format!("{bands} bands"),
-            "extract one, for instance with gdal_translate -b 1; colour imagery is a texture layer",
+            "extract one, for instance with gdal_translate -b 1; imagery has no heights",
         ));
     }
     let tiled = header.count(324) > 0;
@@ -283,7 +294,8 @@ fn place(path: &Path, header: &Header<'_>, layout: Layout, keys: &GeoKeys) -> Re
 struct Metadata {
     scale: f64,
     offset: f64,
-    unit_metres: Option<f64>,
+    /// As [`GeoKeys::vertical_metres`].
+    unit_metres: Option<std::result::Result<f64, String>>,
 }
 
 impl Metadata {
@@ -295,12 +307,9 @@ impl Metadata {
             Some(rest.split_once('<')?.0.trim())
         };
         let number = |role| item(role).and_then(|v| v.parse::<f64>().ok()).filter(|v| v.is_finite());
-        let unit_metres = match item("unittype").map(str::to_lowercase).as_deref() {
-            Some("m" | "metre" | "meter" | "metres" | "meters") => Some(1.0),
-            Some("ft" | "foot" | "feet") => Some(0.3048),
-            Some("us-ft" | "us survey foot" | "ftus") => Some(1200.0 / 3937.0),
-            _ => None,
-        };
+        let said = item("unittype").filter(|t| !matches!(*t, "" | "-" | "unknown"));
+        let unit_metres =
+            said.map(|text| named_metres(text).ok_or(format!("heights in '{text}', a unit not known here")));
         Ok(Self {
             scale: number("scale").filter(|s| *s != 0.0).unwrap_or(1.0),
             offset: number("offset").unwrap_or(0.0),
@@ -358,8 +367,6 @@ impl Chunks {
             part.rows.clone().for_each(|row| out[target(row)].fill(self.hole));
         } else if self.compressed {
             let data = self.chunk(path, part.chunk)?;
-            // Decoded chunks carry no padding to the right of the image.
-            let stride = stride.min((self.layout.width - part.left) as usize);
             for row in part.rows.clone() {
                 let from = (row - part.top) as usize * stride + skip;
                 if !copy(&data, from, &mut out[target(row)]) {
@@ -390,7 +397,11 @@ impl Chunks {
             Some(decoder) => decoder,
             None => self.decoder(path)?,
         };
-        let data = decoder.read_chunk(chunk).map_err(|e| {
+        // With its padding, in one piece: read row by row, the crate (0.11.3) takes the end of some LZW tiles for
+        // damage, where a row's padding and the data end together.
+        let mut data = DecodingResult::U8(Vec::new());
+        let row_bytes = self.layout.chunk_width as usize * self.dtype.bytes();
+        decoder.read_chunk_to_buffer(&mut data, chunk, row_bytes).map_err(|e| {
             let found = format!("an error in strip or tile {chunk} ({e})");
             broken(path, "samples that unpack", found, "the file is damaged: fetch it again")
         })?;

@@ -10,7 +10,8 @@ use super::error::{Result, broken, io_error, options};
 use super::raster::{Dtype, Place, Raster, SIDE_MAX, Samples, SourceCrs};
 use super::samples::{Order, SampleFile};
 
-pub(super) fn open(path: &Path, file: File) -> Result<Raster> {
+/// Opens a square of samples; `name` is the file's own, also where it was packed under another.
+pub(super) fn open(path: &Path, file: File, name: &str) -> Result<Raster> {
     let length = file.metadata().map_err(io_error(path, "ask for its length"))?.len();
     let side = (length / 2).isqrt();
     if side * side * 2 != length || side < 2 || side > u64::from(SIDE_MAX) {
@@ -22,7 +23,6 @@ pub(super) fn open(path: &Path, file: File) -> Result<Raster> {
         ));
     }
     let side = u32::try_from(side).unwrap_or(SIDE_MAX);
-    let name = path.file_name().and_then(|n| n.to_str()).unwrap_or_default();
     let [lon, lat] = corner(name).ok_or_else(|| {
         options(
             path,
@@ -50,6 +50,7 @@ pub(super) fn open(path: &Path, file: File) -> Result<Raster> {
         integer: true,
         height_scale: 1.0,
         height_offset: 0.0,
+        height_doubt: None,
         nodata: Some(-32768.0),
         samples: Samples::File(samples),
     })

@@ -6,7 +6,7 @@
 //! start to end is transcribed once to a temporary file (8 bytes a sample, 1 or 2 for PNG).
 //!
 //! ```text
-//! geotiff hgt ascii_grid usgs_dem png raw → raster → mosaic → (as it is | reproject) → windows
+//! (packed →) geotiff hgt ascii_grid usgs_dem png raw → raster → mosaic → (as it is | reproject) → windows
 //! ```
 //!
 //! Files may be hostile: every size is checked before memory is taken, and what is wrong is an
@@ -18,18 +18,20 @@ mod geokeys;
 mod geotiff;
 mod hgt;
 mod mosaic;
+mod packed;
 mod png;
 mod raster;
 mod reproject;
 mod samples;
+mod sentinels;
 #[cfg(test)]
 mod tests;
 mod tiff_header;
+mod units;
 mod usgs_dem;
 
 use std::fmt;
 use std::fs::File;
-use std::io::{Read, Seek, SeekFrom, Write};
 use std::num::NonZeroU32;
 use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
@@ -48,8 +50,6 @@ use samples::{Order, SampleFile};
 
 /// Decoded strips and tiles kept for one layer.
 const CACHE_BYTES: usize = 128 << 20;
-/// What a gzip may unpack to: some 600 of the largest `.hgt`.
-const UNPACKED_BYTES_MAX: u64 = 64 << 30;
 /// Widest geographic source that one UTM zone may carry, degrees; the scale is 6 % off at its rims.
 const UTM_DEGREES_MAX: f64 = 40.0;
 /// Cells of a source without CRS may be degrees below this: 11 km, coarser than any DEM on land.
@@ -75,7 +75,7 @@ pub struct Options {
     /// Metres of height at value 0 [default: from the file, else 0]
     #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
     pub height_offset: Option<f64>,
-    /// The value that means "no data", instead of the file's
+    /// The value that means "no data", instead of the file's; nan: all values are heights
     #[arg(long, value_name = "VALUE", allow_negative_numbers = true)]
     pub nodata: Option<f64>,
     /// Read the files as bare little-endian samples, rows from the north; types u8 i16 u16 i32 u32 f32 f64
@@ -199,6 +199,8 @@ pub struct Source {
     identity: String,
     mosaic: Mosaic,
     reprojection: Option<Reprojection>,
+    /// Whether the user says that no value stands for "no data".
+    all_heights: bool,
 }
 
 impl fmt::Debug for Source {
@@ -225,8 +227,10 @@ pub fn open(paths: &[PathBuf], options: &Options) -> std::result::Result<Source,
     }
     let mosaic = Mosaic::new(rasters)?;
     let (grid, reprojection) = frame(first, &mosaic, options)?;
+    check_grid(first, &grid)?;
     let identity = identity(paths, options, &grid)?;
-    Ok(Source { grid, identity, mosaic, reprojection })
+    let all_heights = options.nodata.is_some_and(f64::is_nan);
+    Ok(Source { grid, identity, mosaic, reprojection, all_heights })
 }
 
 /// What tells this source from others without reading it.
@@ -246,6 +250,23 @@ impl Source {
     #[must_use]
     pub fn identity(&self) -> &str {
         &self.identity
+    }
+
+    /// Whether, among the values read so far, there was one that usually means "no data" and that nobody
+    /// declared.
+    ///
+    /// # Errors
+    /// When there was: it would become a pit or a spire.
+    pub fn check_nodata(&self) -> std::result::Result<(), IngestError> {
+        match self.mosaic.suspect() {
+            Some((file, value, [low, high])) if !self.all_heights => Err(bad_options(
+                file,
+                format!("heights about as far apart as the others, which are {low} to {high}"),
+                format!("{value}, which usually means \"no data\" and is not declared here"),
+                format!("say --nodata {value}; or, if it is a height, --nodata nan"),
+            )),
+            _ => Ok(()),
+        }
     }
 
     /// The lattice that windows refer to.
@@ -305,21 +326,49 @@ fn check_numbers(file: &Path, options: &Options) -> Result<()> {
     }
 }
 
+/// Refuses lattices and scales that no description of a scene can hold and no client would draw. They come
+/// from the options or from the file.
+fn check_grid(file: &Path, grid: &Grid) -> Result<()> {
+    let sensible = [
+        ("cells from 1e-6 to 1e9 m", grid.cell, 1e-6..1e9),
+        ("coordinates below 1e12 m", grid.origin, 0.0..1e12),
+        ("a height scale from 1e-9 to 1e9 m", [grid.height_scale; 2], 1e-9..1e9),
+        ("a height offset below 1e12 m", [grid.height_offset; 2], 0.0..1e12),
+    ];
+    for (expected, [a, b], range) in sensible {
+        if !range.contains(&a.abs()) || !range.contains(&b.abs()) {
+            let found = if a == b { a.to_string() } else { format!("{a} and {b}") };
+            let remedy = "correct the option, or what the file says of itself (gdal_edit.py can)";
+            return Err(bad_options(file, expected, found, remedy));
+        }
+    }
+    Ok(())
+}
+
 /// Opens one file, whatever its format.
 fn open_file(path: &Path, options: &Options, cache: &Arc<ChunkCache>, id: u32) -> Result<Raster> {
-    let file = File::open(path).map_err(io_error(path, "open it"))?;
-    let metadata = file.metadata().map_err(io_error(path, "ask for its length"))?;
+    // Before it is opened: opening a pipe would wait for somebody to write into it.
+    let metadata = path.metadata().map_err(io_error(path, "open it"))?;
     if metadata.is_dir() {
         return Err(unsupported(path, "a DEM file", "a directory", "name the files in it"));
     }
-    if let Some(shape) = options.raw {
-        return open_raw(path, file, shape);
+    if !metadata.is_file() {
+        let remedy = "write what it holds into a file first, since windows of it are read";
+        return Err(unsupported(path, "a DEM file", "a pipe or device", remedy));
     }
+    let file = File::open(path).map_err(io_error(path, "open it"))?;
     let name = path.file_name().and_then(|n| n.to_str()).unwrap_or_default().to_ascii_lowercase();
     let mut magic = [0; 2];
     let gzipped = file.read_exact_at(&mut magic, 0).is_ok() && magic == [0x1f, 0x8b];
+    if let Some(shape) = options.raw {
+        // Bare samples may begin with any bytes.
+        let file = if gzipped && name.ends_with(".gz") { packed::gunzip(path, file)? } else { file };
+        return open_raw(path, file, shape);
+    }
     let (file, name) = if gzipped {
-        (unpack(path, file)?, name.strip_suffix(".gz").unwrap_or(&name).to_owned())
+        (packed::gunzip(path, file)?, name.strip_suffix(".gz").unwrap_or(&name).to_owned())
+    } else if magic == *b"PK" {
+        packed::unzip(path, file)?
     } else {
         (file, name)
     };
@@ -335,12 +384,11 @@ fn detect(path: &Path, file: File, name: &str, cache: &Arc<ChunkCache>, id: u32)
     let text = text[..text.len().min(16)].to_ascii_lowercase();
     match &start[..] {
         [] => Err(broken(path, "a DEM", "an empty file", "fetch it again")),
-        _ if name.ends_with(".hgt") => hgt::open(path, file),
+        _ if name.ends_with(".hgt") => hgt::open(path, file, name),
         [b'I', b'I', 42 | 43, 0, ..] | [b'M', b'M', 0, 42 | 43, ..] => {
             geotiff::open(path, file, Arc::clone(cache), id)
         }
         [0x89, b'P', b'N', b'G', ..] => png::open(path, file),
-        [b'P', b'K', 3 | 5, ..] => ascii_grid::open_zip(path, file),
         _ if text.starts_with(b"ncols") || text.starts_with(b"nrows") => ascii_grid::open(path, file),
         _ if usgs_dem::looks_like(&start) => usgs_dem::open(path, &file),
         _ => {
@@ -352,36 +400,12 @@ fn detect(path: &Path, file: File, name: &str, cache: &Arc<ChunkCache>, id: u32)
             };
             Err(unsupported(
                 path,
-                "GeoTIFF, SRTM .hgt, Arc ASCII grid (or one in a zip), USGS ASCII DEM or greyscale PNG",
+                "GeoTIFF, SRTM .hgt, Arc ASCII grid, USGS ASCII DEM or greyscale PNG, or one of these in a gzip or zip",
                 found,
                 "convert it to GeoTIFF, or describe bare samples with --raw WIDTHxHEIGHT:TYPE",
             ))
         }
     }
-}
-
-/// Unpacks a gzip into a temporary file.
-fn unpack(path: &Path, file: File) -> Result<File> {
-    let mut unpacked = tempfile::tempfile().map_err(io_error(path, "create a temporary file"))?;
-    let mut reader = flate2::read::MultiGzDecoder::new(std::io::BufReader::new(file));
-    let mut buffer = vec![0; 1 << 18];
-    let mut total = 0;
-    loop {
-        let read = reader.read(&mut buffer).map_err(|e| {
-            broken(path, "a whole gzip", e.to_string(), "the file was cut short or damaged: fetch it again")
-        })?;
-        if read == 0 {
-            break;
-        }
-        total += read as u64;
-        if total > UNPACKED_BYTES_MAX {
-            let expected = format!("at most {UNPACKED_BYTES_MAX} bytes when unpacked");
-            return Err(broken(path, expected, "more", "unpack it and give the file itself"));
-        }
-        unpacked.write_all(&buffer[..read]).map_err(io_error(path, "write a temporary file"))?;
-    }
-    unpacked.seek(SeekFrom::Start(0)).map_err(io_error(path, "rewind a temporary file"))?;
-    Ok(unpacked)
 }
 
 fn open_raw(path: &Path, file: File, shape: RawShape) -> Result<Raster> {
@@ -397,6 +421,7 @@ fn open_raw(path: &Path, file: File, shape: RawShape) -> Result<Raster> {
         integer: dtype.is_integer(),
         height_scale: 1.0,
         height_offset: 0.0,
+        height_doubt: None,
         nodata: None,
         samples: Samples::File(samples),
     })
@@ -404,7 +429,9 @@ fn open_raw(path: &Path, file: File, shape: RawShape) -> Result<Raster> {
 
 /// Applies what the command line says of values.
 fn override_values(raster: &mut Raster, options: &Options) -> Result<()> {
-    if let Some(nodata) = options.nodata {
+    if options.nodata.is_some_and(f64::is_nan) {
+        raster.nodata = None;
+    } else if let Some(nodata) = options.nodata {
         raster.nodata = Some(raster.dtype.hold(nodata).ok_or_else(|| {
             bad_options(
                 &raster.file,
@@ -413,6 +440,14 @@ fn override_values(raster: &mut Raster, options: &Options) -> Result<()> {
                 "correct it, or leave it out to use the file's own",
             )
         })?);
+    }
+    if let (Some(found), None) = (&raster.height_doubt, options.height_scale) {
+        return Err(bad_options(
+            &raster.file,
+            "heights that grow upwards, in a unit known here",
+            found.as_str(),
+            "say --height-scale with the metres of one unit: 1 for metres, 0.3048 for feet, below 0 for depths",
+        ));
     }
     raster.height_scale = options.height_scale.unwrap_or(raster.height_scale);
     raster.height_offset = options.height_offset.unwrap_or(raster.height_offset);
@@ -445,15 +480,24 @@ fn assume_crs(raster: &mut Raster, options: &Options) -> Result<()> {
     Ok(())
 }
 
-/// Whether coordinates without a CRS must be longitudes and latitudes: small cells in the range of degrees,
-/// away from (0, 0), where the local systems of laboratories and sites begin.
+/// Whether coordinates without a CRS must be longitudes (from -180 or from 0) and latitudes: small cells in the
+/// range of degrees, away from (0, 0), where the local systems of laboratories and sites begin and where there
+/// is nothing but sea; or once around the globe.
 fn looks_like_degrees(mosaic: &Mosaic, place: &Place) -> bool {
-    let sides = [(0, mosaic.width, 180.0), (1, mosaic.height, 90.0)];
-    sides.into_iter().all(|(axis, samples, limit)| {
+    let ends = |axis: usize, samples: u32| {
         let (low, step) = (place.origin[axis], place.step[axis]);
-        let high = low + step * f64::from(samples - 1);
-        step < DEGREES_STEP_MAX && low >= -limit && high <= limit && (low > 1.0 || high < -1.0)
-    })
+        // A cell may reach half beyond its sample, and rounding a little more.
+        (low + 0.5 * step + 1e-6, low + step * (f64::from(samples) - 1.5) - 1e-6)
+    };
+    let [(west, east), (south, north)] = [ends(0, mosaic.width), ends(1, mosaic.height)];
+    let in_range = west >= -180.0 && east <= 360.0 && south >= -90.0 && north <= 90.0;
+    let small = place.step.iter().all(|step| *step < DEGREES_STEP_MAX);
+    let beyond = |far: f64| move |(low, high): &(f64, f64)| *low > far || *high < -far;
+    let sides = [(west, east), (south, north)];
+    // The nearest land is off by 4.7 degrees of latitude (Ghana), the nearest on the equator by 9 (Gabon).
+    let away = sides.iter().all(beyond(1.0)) || sides.iter().any(beyond(4.5));
+    let around = (place.step[0] * f64::from(mosaic.width) - 360.0).abs() < 2.0 * place.step[0];
+    in_range && ((small && away) || around)
 }
 
 /// Decides the frame: the source's own lattice or a resampled one.

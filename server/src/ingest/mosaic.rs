@@ -5,6 +5,8 @@
 
 use super::error::{IngestError, Result};
 use super::raster::{Place, Raster, SIDE_MAX, Window};
+use super::sentinels::Seen;
+use std::path::Path;
 
 /// Cells of two files may differ by this share.
 const CELL_TOLERANCE: f64 = 1e-6;
@@ -17,6 +19,7 @@ pub(super) struct Mosaic {
     pub(super) width: u32,
     pub(super) height: u32,
     pub(super) place: Option<Place>,
+    seen: Seen,
 }
 
 impl Mosaic {
@@ -25,7 +28,7 @@ impl Mosaic {
         if rasters.len() == 1 {
             let (width, height, place) = (first.width, first.height, first.place.clone());
             let parts = rasters.into_iter().map(|r| (r, 0, 0)).collect();
-            return Ok(Self { parts, width, height, place });
+            return Ok(Self { parts, width, height, place, seen: Seen::default() });
         }
         let mut offsets = Vec::with_capacity(rasters.len());
         for raster in &rasters {
@@ -55,12 +58,19 @@ impl Mosaic {
             height = height.max(y + raster.height);
             parts.push((raster, x, y));
         }
-        Ok(Self { parts, width, height, place })
+        Ok(Self { parts, width, height, place, seen: Seen::default() })
     }
 
     pub(super) fn first(&self) -> &Raster {
         // `new` refuses an empty list.
         &self.parts[0].0
+    }
+
+    /// A value that usually means "no data", met among the heights read so far: its file, itself, and the
+    /// range of all other values.
+    pub(super) fn suspect(&self) -> Option<(&Path, f64, [f64; 2])> {
+        let (value, number, range) = self.seen.suspect()?;
+        Some((&self.parts.get(number)?.0.file, value, range))
     }
 
     pub(super) fn integer(&self) -> bool {
@@ -70,16 +80,19 @@ impl Mosaic {
     /// Fills `out` with the window's values, rows from the south, NaN for nodata and gaps.
     pub(super) fn read(&self, window: Window, out: &mut [f64]) -> Result<()> {
         if let [(raster, ..)] = &self.parts[..] {
-            return raster.read(window, out);
+            raster.read(window, out)?;
+            self.seen.note(0, out);
+            return Ok(());
         }
         out.fill(f64::NAN);
         let mut scratch = Vec::new();
-        for (raster, x, y) in &self.parts {
+        for (number, (raster, x, y)) in self.parts.iter().enumerate() {
             let Some(common) = overlap(window, *x, *y, raster) else { continue };
             let own = Window { x0: common.x0 - x, y0: common.y0 - y, ..common };
             scratch.clear();
             scratch.resize(own.samples(), f64::NAN);
             raster.read(own, &mut scratch)?;
+            self.seen.note(number, &scratch);
             let left = (common.x0 - window.x0) as usize;
             let rows = out.chunks_exact_mut(window.width as usize).skip((common.y0 - window.y0) as usize);
             for (row, from) in rows.zip(scratch.chunks_exact(common.width as usize)) {

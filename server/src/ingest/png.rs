@@ -48,7 +48,7 @@ pub(super) fn open(path: &Path, file: File) -> Result<Raster> {
                 path,
                 "a greyscale picture of heights",
                 format!("{colour:?}: imagery"),
-                "give it as a texture layer, or save its heights as 16-bit greyscale",
+                "save the heights themselves as 16-bit greyscale; imagery has none",
             ));
         }
     };
@@ -69,6 +69,7 @@ pub(super) fn open(path: &Path, file: File) -> Result<Raster> {
         integer: true,
         height_scale: 1.0,
         height_offset: 0.0,
+        height_doubt: None,
         nodata: None,
         samples: Samples::File(samples),
     })

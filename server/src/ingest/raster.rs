@@ -45,7 +45,8 @@ impl SourceCrs {
     pub(super) fn new(name: String, proj4: Option<String>, geographic: bool) -> Self {
         let known = proj4.as_deref().and_then(|text| Projection::new(text).ok());
         let geographic = known.as_ref().map_or(geographic, Projection::is_geographic);
-        let metres_per_unit = known.map_or(1.0, |p| p.metres_per_unit());
+        // Units are known also where the formulas are not.
+        let metres_per_unit = proj4.as_deref().map_or(1.0, projection::unit_metres);
         Self { name, proj4, geographic, metres_per_unit }
     }
 }
@@ -147,6 +148,8 @@ pub(super) struct Raster {
     pub(super) integer: bool,
     pub(super) height_scale: f64,
     pub(super) height_offset: f64,
+    /// What the file says of its heights, where it is unclear how many metres a value is.
+    pub(super) height_doubt: Option<String>,
     pub(super) nodata: Option<f64>,
     pub(super) samples: Samples,
 }

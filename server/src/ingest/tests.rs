@@ -249,6 +249,177 @@ fn feet_become_metres() {
     assert!((grid.height_scale - 0.3048).abs() < 1e-12);
 }
 
+/// Heights in feet became 3.28 times as high where the vertical CRS alone said so.
+#[test]
+fn a_vertical_crs_tells_the_unit_of_heights() {
+    let folder = folder();
+    let open_with = |keys: &[[u16; 4]], options: &Options| {
+        let plain = [[1024, 0, 1, 1], [1025, 0, 1, 2], [3072, 0, 1, 32632]];
+        let tags = Tags::new(&if keys.iter().any(|k| matches!(k[0], 2048 | 3072)) {
+            keys.to_vec()
+        } else {
+            [&plain[..], keys].concat()
+        });
+        let path = put(&folder, "a.tif", &tiff!(colortype::GrayI16, 4, 3, [100i16; 12], &tags));
+        open(&[path], options).map(|source| source.grid().height_scale)
+    };
+    let us_foot = 1200.0 / 3937.0;
+    for (keys, metres) in [
+        (vec![[4096, 0, 1, 6360]], us_foot),
+        (vec![[4096, 0, 1, 5702]], us_foot),
+        (vec![[4096, 0, 1, 8228]], 0.3048),
+        (vec![[4096, 0, 1, 5703]], 1.0),
+        (vec![[4096, 0, 1, 3855]], 1.0),
+        (vec![[4096, 0, 1, 5773]], 1.0),
+        (vec![[4096, 0, 1, 32767]], 1.0),
+        (vec![[4096, 0, 1, 4979]], 1.0),
+        (vec![[4096, 0, 1, 4937]], 1.0),
+        // The unit's own key has the last word.
+        (vec![[4096, 0, 1, 5703], [4099, 0, 1, 9002]], 0.3048),
+        (vec![[4096, 0, 1, 32767], [4099, 0, 1, 9003]], us_foot),
+        // Compound systems in the place of plain ones: NAD27 + NGVD29 in feet, NAD83(2011) + NAVD88 in metres,
+        // California zone 1 + NAVD88 in feet, OSGB36 + ODN in metres.
+        (vec![[1024, 0, 1, 2], [2048, 0, 1, 7406]], us_foot),
+        (vec![[1024, 0, 1, 2], [2048, 0, 1, 6349]], 1.0),
+        (vec![[1024, 0, 1, 1], [3072, 0, 1, 8714]], us_foot),
+        (vec![[1024, 0, 1, 1], [3072, 0, 1, 7405]], 1.0),
+    ] {
+        let found = open_with(&keys, &source_crs()).unwrap_or_else(|e| panic!("{keys:?}: {e}"));
+        assert!((found - metres).abs() < 1e-12, "{keys:?}: {found} for {metres}");
+    }
+    for (keys, word) in [
+        ([[4096, 0, 1, 5715], [4099, 0, 1, 9001]], "depths, which grow downwards"),
+        ([[4096, 0, 1, 6358], [1025, 0, 1, 2]], "EPSG:6358"),
+        ([[4096, 0, 1, 12_345], [1025, 0, 1, 2]], "EPSG:12345, whose unit is not known"),
+        ([[4099, 0, 1, 9999], [1025, 0, 1, 2]], "unit EPSG:9999"),
+    ] {
+        let message = open_with(&keys, &Options::default()).unwrap_err().to_string();
+        for word in [word, "a.tif", "--height-scale", "below 0 for depths"] {
+            assert!(message.contains(word), "no '{word}' in: {message}");
+        }
+        let told = Options { height_scale: Some(-1.0), ..Options::default() };
+        assert_eq!(open_with(&keys, &told).unwrap(), -1.0);
+    }
+}
+
+/// Feet became metres where the projection itself is not built in.
+#[test]
+fn units_of_projections_that_are_not_built_in_are_known() {
+    let folder = folder();
+    // Oblique Mercator (Oregon) in feet, Cassini (Trinidad) in Clarke's links.
+    for (code, metres) in [(6809, 0.3048), (2066, 0.201_166_195_164)] {
+        assert!(crate::projection::Projection::new(crate::projection::epsg(code.into()).unwrap()).is_err());
+        let tags = Tags::new(&[[1024, 0, 1, 1], [1025, 0, 1, 2], [3072, 0, 1, code]]);
+        let path = put(&folder, "a.tif", &tiff!(colortype::GrayI16, 4, 3, [1i16; 12], &tags));
+        let grid = open(&[path], &Options::default()).unwrap().grid().clone();
+        assert!((grid.cell[0] - 30.0 * metres).abs() < 1e-9, "{code}: {:?}", grid.cell);
+    }
+}
+
+#[test]
+fn units_go_by_many_names() {
+    for (text, metres) in [
+        ("m", 1.0),
+        ("Metres", 1.0),
+        ("metre above sea level", 1.0),
+        ("ft", 0.3048),
+        ("feet (US)", 1200.0 / 3937.0),
+        ("US survey foot", 1200.0 / 3937.0),
+        ("us-ft", 1200.0 / 3937.0),
+        ("US_survey_foot", 1200.0 / 3937.0),
+        ("international foot", 0.3048),
+        ("cm", 0.01),
+        ("decimeters", 0.1),
+        ("fathoms", 1.8288),
+    ] {
+        assert_eq!(super::units::named_metres(text), Some(metres), "{text}");
+    }
+    for text in ["", "degrees", "kelvin", "counts"] {
+        assert_eq!(super::units::named_metres(text), None, "{text}");
+    }
+}
+
+#[test]
+fn units_of_coordinates_that_are_not_known_are_refused() {
+    let folder = folder();
+    for (keys, word) in [
+        (vec![[1024, 0, 1, 1], [3072, 0, 1, 32767], [3075, 0, 1, 1], [3076, 0, 1, 9999]], "unit EPSG:9999"),
+        (vec![[1024, 0, 1, 2], [2048, 0, 1, 4326], [2054, 0, 1, 9105]], "angles in unit EPSG:9105"),
+        (vec![[1024, 0, 1, 2], [2048, 0, 1, 4807]], "unit is the grad"),
+    ] {
+        let path = put(&folder, "a.tif", &tiff!(colortype::GrayI16, 4, 3, [1i16; 12], &Tags::new(&keys)));
+        let message = open(&[path], &source_crs()).unwrap_err().to_string();
+        assert!(message.contains(word) && message.contains("gdalwarp"), "{message}");
+    }
+}
+
+/// A mask in a directory of its own was overlooked: what it hides was drawn.
+#[test]
+fn a_mask_beside_the_samples_is_refused() {
+    let folder = folder();
+    for (kind, is_mask) in [(1u32, false), (4, true), (5, true)] {
+        let mut bytes = Cursor::new(Vec::new());
+        let mut encoder = TiffEncoder::new(&mut bytes).unwrap();
+        encoder.new_image::<colortype::GrayI16>(2, 2).unwrap().write_data(&[1i16; 4]).unwrap();
+        let mut second = encoder.new_image::<colortype::Gray8>(2, 2).unwrap();
+        second.encoder().write_tag(Tag::NewSubfileType, kind).unwrap();
+        second.write_data(&[255u8; 4]).unwrap();
+        let path = put(&folder, "a.tif", &bytes.into_inner());
+        match open(&[path], &Options { cell: Some(1.0), ..Options::default() }) {
+            Ok(_) => assert!(!is_mask, "a mask was overlooked"),
+            Err(e) => assert!(is_mask && e.to_string().contains("gdalwarp -dstnodata"), "{e}"),
+        }
+    }
+}
+
+/// The bytes of the only strip of a TIFF.
+fn strip(bytes: &[u8]) -> Vec<u8> {
+    let mut decoder = tiff::decoder::Decoder::new(Cursor::new(bytes)).unwrap();
+    let mut tag = |tag| usize::try_from(decoder.get_tag_u64(tag).unwrap()).unwrap();
+    let (at, length) = (tag(Tag::StripOffsets), tag(Tag::StripByteCounts));
+    bytes[at..at + length].to_vec()
+}
+
+/// One LZW tile in ten at the right side of whole files was called damaged.
+#[test]
+fn a_packed_tile_beyond_the_image_reads_to_its_last_row() {
+    let folder = folder();
+    for pattern in 0..200usize {
+        let sample = |x: usize, y: usize| match pattern % 3 {
+            0 => (x / 8 * 7 + y * (pattern + 1)) % 251,
+            1 => (x * y * pattern + x * x) % 7,
+            _ => (x * 31 + y * 17 + x * y * pattern) % 256,
+        };
+        let samples: Vec<u8> = (0..256).map(|i| u8::try_from(sample(i % 16, i / 16)).unwrap()).collect();
+        let packed = Tags { compression: Compression::Lzw, rows_per_strip: 16, ..Tags::new(&[]) };
+        let data = strip(&tiff!(colortype::Gray8, 16, 16, samples, &packed));
+        let length = u32::try_from(data.len()).unwrap();
+        // One tile of 16 x 16, of which the image is the first 6 columns and 16 rows.
+        let bytes = raw_tiff(
+            &[
+                (256, 4, 1, 6),
+                (257, 4, 1, 16),
+                (258, 3, 1, 8),
+                (259, 3, 1, 5),
+                (262, 3, 1, 1),
+                (277, 3, 1, 1),
+                (322, 4, 1, 16),
+                (323, 4, 1, 16),
+                (324, 4, 1, 8 + 2 + 10 * 12 + 4),
+                (325, 4, 1, length),
+            ],
+            &data,
+        );
+        let path = put(&folder, "a.tif", &bytes);
+        let source = open(&[path], &Options { cell: Some(1.0), ..Options::default() }).unwrap();
+        let mut values = Vec::new();
+        source.read(0, 0, 6, 16, &mut values).unwrap_or_else(|e| panic!("pattern {pattern}: {e}"));
+        let expected = (0..16).rev().flat_map(|y| (0..6).map(move |x| (x, y)));
+        let expected: Vec<f64> = expected.map(|(x, y)| f64::from(samples[y * 16 + x])).collect();
+        assert_eq!(values, expected, "pattern {pattern}");
+    }
+}
+
 #[test]
 fn a_tiled_tiff_by_hand_reads_in_order() {
     let folder = folder();
@@ -472,6 +643,21 @@ fn degrees_without_a_crs_are_refused_or_assumed() {
     let as_it_is = Options { cell: Some(10.0), ..Options::default() };
     let grid = open(&degrees, &as_it_is).unwrap().grid().clone();
     assert_eq!((grid.crs, grid.origin, grid.cell), (None, [0.0; 2], [10.0; 2]));
+    // Longitudes from 0 to 360; across Greenwich; across the equator.
+    for origin in [[204.9, 19.75], [-0.001, 51.5], [35.2, 0.001]] {
+        for options in [Options::default(), source_crs()] {
+            let message = open(&plain(origin, 1e-4), &options).unwrap_err().to_string();
+            assert!(message.contains("look like degrees"), "{origin:?}: {message}");
+        }
+    }
+    // Coarse, but once around the globe.
+    let globe = Tags { origin: [-180.0, 90.0], step: 9.0, ..Tags::new(&[]) };
+    let globe = put(&folder, "globe.tif", &tiff!(colortype::GrayI16, 40, 20, [7i16; 800], &globe));
+    assert!(open(&[globe], &Options::default()).unwrap_err().to_string().contains("look like degrees"));
+    let east = open(&plain([204.9, 19.75], 1e-4), &assumed).unwrap().grid().clone();
+    assert_eq!(east.crs.as_ref().unwrap().name, "EPSG:32605");
+    let west = open(&plain([-155.1, 19.75], 1e-4), &assumed).unwrap().grid().clone();
+    assert!((east.origin[0] - west.origin[0]).abs() < 1e-3, "{:?} {:?}", east.origin, west.origin);
     // A wave tank at (0, 0), a site in metres, a source with a CRS: all as before.
     for (origin, step) in [([0.0, 3.4], 0.014), ([382_250.0, 6_354_700.0], 1.0), ([-155.1, 19.75], 30.0)] {
         let grid = open(&plain(origin, step), &Options::default()).unwrap().grid().clone();
@@ -514,11 +700,11 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
     encoder.finish().unwrap()
 }
 
-fn zip_of(files: &[(&str, &str)]) -> Vec<u8> {
+fn zip_of(files: &[(&str, &[u8])]) -> Vec<u8> {
     let mut writer = zip::ZipWriter::new(Cursor::new(Vec::new()));
-    for (name, text) in files {
+    for (name, bytes) in files {
         writer.start_file(*name, zip::write::SimpleFileOptions::default()).unwrap();
-        writer.write_all(text.as_bytes()).unwrap();
+        writer.write_all(bytes).unwrap();
     }
     writer.finish().unwrap().into_inner()
 }
@@ -536,7 +722,7 @@ fn other_formats_read_their_values() {
         assert_eq!(text(&whole_grid(&source)), text(expected));
         source.grid().clone()
     };
-    for bytes in [ASC.into(), zip_of(&[("a.prj", ""), ("b/c.ASC", ASC)]), gzip(ASC.as_bytes())] {
+    for bytes in [ASC.into(), zip_of(&[("a.prj", b""), ("b/c.ASC", ASC.as_bytes())]), gzip(ASC.as_bytes())] {
         let grid = check(put(&folder, "a.bin", &bytes), &Options::default(), &[4.0, nan, 6.0, 1.0, 2.0, 3.0]);
         assert_eq!((grid.origin, grid.cell, grid.integer), ([11.0, 20.0], [2.0, 4.0], true));
     }
@@ -547,6 +733,15 @@ fn other_formats_read_their_values() {
     };
     check_hgt("S46W066.hgt", &hgt);
     check_hgt("s46w066.SRTMGL1.hgt.gz", &gzip(&hgt));
+    let notes: (&str, &[u8]) = ("readme.txt", b"");
+    check_hgt("tile.zip", &zip_of(&[notes, ("S46W066.hgt", &hgt)]));
+    check_hgt("tile.zip", &zip_of(&[("__MACOSX/._S46W066.hgt", b"x"), ("deep/S46W066.HGT", &hgt)]));
+    let tiff = tiff!(colortype::GrayI16, 2, 2, [1i16, 2, 3, 4], &Tags::utm());
+    check(
+        put(&folder, "a.zip", &zip_of(&[("a.tif", &tiff), ("a.tif.aux.xml", b"")])),
+        &source_crs(),
+        &[3.0, 4.0, 1.0, 2.0],
+    );
     let png = png_bytes(::png::ColorType::Grayscale, ::png::BitDepth::Sixteen, 2, &[0, 1, 1, 0, 0, 3, 0, 4]);
     let options = Options { cell: Some(160.0), height_scale: Some(0.1), ..Options::default() };
     let grid = check(put(&folder, "a.png", &png), &options, &[3.0, 4.0, 1.0, 256.0]);
@@ -555,6 +750,7 @@ fn other_formats_read_their_values() {
     let raw_options =
         Options { cell: Some(1.0), raw: Some("2x2:f32".parse().unwrap()), ..Options::default() };
     check(put(&folder, "a.raw", &raw), &raw_options, &[3.0, 4.0, 1.5, 2.0]);
+    check(put(&folder, "a.raw.gz", &gzip(&raw)), &raw_options, &[3.0, 4.0, 1.5, 2.0]);
 }
 
 /// A USGS DEM of two columns, the second one sample shorter and higher.
@@ -624,7 +820,7 @@ fn cases() -> Vec<Case> {
         ("absurd tiles", "a.tif", absurd(true), plain(), &["4000000000", "16777216"]),
         ("one huge strip", "a.tif", one_strip, plain(), &["strips or tiles"]),
         ("a list beyond the file", "a.tif", many, plain(), &["inside the file", "273"]),
-        ("colour TIFF", "a.tif", colour, plain(), &["3 bands", "texture"]),
+        ("colour TIFF", "a.tif", colour, plain(), &["3 bands", "gdal_translate -b 1"]),
         ("empty", "a.tif", Vec::new(), plain(), &["an empty file"]),
         ("no DEM", "a.txt", text("Dear reader,\n"), plain(), &["dear reader", "GeoTIFF"]),
         ("binary", "a.bin", vec![0, 1, 2, 3], plain(), &["00, 01, 02, 03"]),
@@ -654,8 +850,14 @@ fn cases() -> Vec<Case> {
         ("no size", "a.asc", text("ncols 3\ncellsize 1\n1"), plain(), &["'nrows'"]),
         ("absurd .asc", "a.asc", text("ncols 4e9\n"), plain(), &["sizes from 1", "ncols"]),
         ("long word", "a.asc", text(&format!("ncols {}", "1".repeat(99))), plain(), &["at most 64"]),
-        ("no grid in zip", "a.zip", zip_of(&[("a.txt", "x")]), plain(), &["exactly one .asc", "0 among 1"]),
-        ("two grids", "a.zip", zip_of(&[("a.asc", ASC), ("b.asc", ASC)]), plain(), &["2 among 2"]),
+        ("no grid in zip", "a.zip", zip_of(&[("a.txt", b"x")]), plain(), &["exactly one DEM", "0 among 1"]),
+        (
+            "two grids",
+            "a.zip",
+            zip_of(&[("a.asc", ASC.as_bytes()), ("b.asc", ASC.as_bytes())]),
+            plain(),
+            &["2 among 2"],
+        ),
         ("broken zip", "a.zip", b"PK\x03\x04xxxxxxx".to_vec(), plain(), &["zip"]),
         ("broken gzip", "a.asc.gz", gzip(ASC.as_bytes())[..30].to_vec(), plain(), &["a whole gzip"]),
         ("cut USGS", "a.dem", cut_usgs, plain(), &["2 columns"]),
@@ -748,7 +950,7 @@ fn damaged_files_do_not_panic() {
         ("a.tif", tiff!(colortype::GrayI16, 32, 32, samples, &lzw)),
         ("a.dem", usgs()),
         ("a.asc", ASC.as_bytes().to_vec()),
-        ("a.zip", zip_of(&[("a.asc", ASC)])),
+        ("a.zip", zip_of(&[("a.asc", ASC.as_bytes())])),
     ];
     let mut random = 0x2545_f491_4f6c_dd1d_u64;
     let mut next = |below: usize| {
@@ -831,6 +1033,26 @@ fn every_real_dem_is_as_its_manifest_says() {
         let integer = row["dtype"].contains("int");
         assert!(grid.integer == integer || file.ends_with(".asc"), "{file}: integer {}", grid.integer);
     }
+}
+
+/// A real file without a CRS, whose longitudes run from 0 to 360, became a scene of 6 cm.
+#[test]
+fn the_real_file_of_degrees_without_a_crs_is_refused_and_built_as_told() {
+    let Some(folder) = real_data() else { return };
+    let path = [folder.join("hilo/hilo_grid_1_3_arsec.tif")];
+    for options in [Options::default(), source_crs()] {
+        let message = open(&path, &options).unwrap_err().to_string();
+        let words = ["hilo_grid_1_3_arsec.tif", "look like degrees", "--assume-crs EPSG:4326"];
+        assert!(words.iter().all(|w| message.contains(w)), "{message}");
+    }
+    let told = Options { assume_crs: NonZeroU32::new(4326), ..Options::default() };
+    let source = open(&path, &told).unwrap();
+    let grid = source.grid();
+    // Hilo lies in zone 5; a third of an arc second is some 10 m.
+    assert_eq!(grid.crs.as_ref().unwrap().name, "EPSG:32605");
+    assert!((9.0..11.0).contains(&grid.cell[0]), "{:?}", grid.cell);
+    let valid = whole_grid(&source).iter().filter(|v| !v.is_nan()).count();
+    assert!(valid as f64 > 0.9 * 701.0 * 692.0, "{valid}");
 }
 
 /// `--crs auto` on every real DEM: degrees are resampled and keep their mean height and cell.

@@ -33,14 +33,21 @@ pub(super) struct Header<'a> {
     file: &'a File,
     pub(super) length: u64,
     pub(super) big_endian: bool,
+    big: bool,
     entries: Vec<Entry>,
+    /// Where the next directory is; 0 if there is none.
+    next: u64,
 }
+
+/// Directories after the first that are looked at, at most: overviews and masks, one for each halving.
+const DIRECTORIES_MAX: usize = 64;
 
 impl<'a> Header<'a> {
     /// Reads the directory; every entry's values lie inside the file afterwards.
     pub(super) fn read(path: &'a Path, file: &'a File) -> Result<Self> {
         let length = file.metadata().map_err(io_error(path, "ask for its length"))?.len();
-        let mut header = Self { path, file, length, big_endian: false, entries: Vec::new() };
+        let mut header =
+            Self { path, file, length, big_endian: false, big: false, entries: Vec::new(), next: 0 };
         let start: [u8; 16] = header.bytes(0, if length < 16 { 8 } else { 16 })?;
         header.big_endian = &start[..2] == b"MM";
         let big = header.number(&start[2..4]) == 43;
@@ -70,7 +77,40 @@ impl<'a> Header<'a> {
             }
             header.entries.push(Entry { tag, kind, count, at });
         }
+        let next: Result<[u8; 8]> =
+            header.bytes(at + count_bytes as u64 + count * entry_bytes as u64, inline);
+        // Files exist that end with their last entry: then no other follows.
+        header.next = next.map_or(0, |bytes| header.number(&bytes[..inline]));
+        header.big = big;
         Ok(header)
+    }
+
+    /// Whether a later directory holds a mask that says which samples of the first are valid.
+    pub(super) fn has_mask(&self) -> bool {
+        let (count_bytes, entry_bytes, inline) = if self.big { (8, 20, 8) } else { (2, 12, 4) };
+        let mut at = self.next;
+        for _ in 0..DIRECTORIES_MAX {
+            if at == 0 {
+                return false;
+            }
+            let Ok(count) = self.bytes::<8>(at, count_bytes) else { return false };
+            let count = self.number(&count[..count_bytes]).min(ENTRIES_MAX);
+            for i in 0..count {
+                let place = at + count_bytes as u64 + i * entry_bytes as u64;
+                let Ok(e) = self.bytes::<20>(place, entry_bytes) else { return false };
+                // NewSubfileType, whose bit 2 says "transparency mask"; it comes first, as the least tag.
+                let kind = usize::try_from(size_of_kind(self.short(&e[2..4]))).unwrap_or(4);
+                if self.short(&e[..2]) == 254
+                    && self.number(&e[4 + inline..4 + inline + kind.min(inline)]) & 4 != 0
+                {
+                    return true;
+                }
+            }
+            let end = at + count_bytes as u64 + count * entry_bytes as u64;
+            let Ok(next) = self.bytes::<8>(end, inline) else { return false };
+            at = self.number(&next[..inline]);
+        }
+        false
     }
 
     /// How many values a tag has; 0 without the tag.

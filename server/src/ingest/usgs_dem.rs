@@ -118,6 +118,7 @@ pub(super) fn open(path: &Path, file: &File) -> Result<Raster> {
         integer,
         height_scale: header.height_metres,
         height_offset: 0.0,
+        height_doubt: None,
         nodata: None,
         samples: Samples::File(samples),
     })

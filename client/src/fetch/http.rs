@@ -1,0 +1,266 @@
+//! One server over HTTP: addresses, answers and their limits, and what has gone over the wire.
+
+use super::{FetchError, TRIES_MAX, Traffic};
+use bytes::Bytes;
+use diamantina_protocol::index;
+use diamantina_protocol::message::{self, Catalogue, Layer, Scene};
+use reqwest::{Client, Response, StatusCode, Url};
+use std::hash::BuildHasher;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+/// The pause after the first failure; it doubles with each, up to [`PAUSE_MAX`].
+const PAUSE: Duration = Duration::from_millis(100);
+
+/// The longest pause, also where the server asks for a longer one.
+const PAUSE_MAX: Duration = Duration::from_secs(10);
+
+/// The largest answer in JSON, in bytes.
+const JSON_BYTES_MAX: usize = 4 << 20;
+
+/// The largest page of the index before and after decompression, in bytes.
+pub(super) const PAGE_BYTES_MAX: usize = 4 * index::PAGE_BYTES_MAX;
+
+/// The most layers of a scene.
+pub const LAYERS_MAX: usize = 64;
+
+/// The base of an address, and the scene that it names.
+pub(super) fn parse_address(text: &str) -> Result<(Url, Option<String>), FetchError> {
+    let wrong = |reason: &str| FetchError::Address { url: text.to_owned(), reason: reason.to_owned() };
+    let mut url = Url::parse(text).map_err(|e| wrong(&e.to_string()))?;
+    if url.scheme() != "http" {
+        return Err(wrong("this build speaks http only"));
+    }
+    if url.host_str().is_none() {
+        return Err(wrong("it has no host"));
+    }
+    url.set_query(None);
+    url.set_fragment(None);
+    let path = url.path().trim_end_matches('/').to_owned();
+    let (prefix, name) = match path.rsplit_once("/scenes/") {
+        Some((prefix, name)) => (prefix, Some(name)),
+        None => (path.strip_suffix("/scenes").unwrap_or(&path), None),
+    };
+    if name.is_some_and(|name| !message::is_name(name)) {
+        return Err(wrong("after /scenes/ comes one name"));
+    }
+    url.set_path(prefix);
+    Ok((url, name.map(str::to_owned)))
+}
+
+/// Why a scene cannot be shown, if so: it comes from outside.
+fn check(scene: &Scene) -> Result<(), String> {
+    if scene.layers.is_empty() || scene.layers.len() > LAYERS_MAX {
+        return Err(format!("{} layers, expected 1 to {LAYERS_MAX}", scene.layers.len()));
+    }
+    if !message::is_name(&scene.name) || !message::is_name(&scene.version) {
+        return Err("its name or version is none".into());
+    }
+    for layer in &scene.layers {
+        let Layer { name, forest, coding, origin, cell, heights, .. } = layer;
+        if !message::is_name(name) {
+            return Err("a layer's name is none".into());
+        }
+        if coding.levels() != forest.levels() {
+            return Err(format!(
+                "layer '{name}': coding for {} levels, forest of {}",
+                coding.levels(),
+                forest.levels()
+            ));
+        }
+        let finite = [origin[0], origin[1], layer.height_offset, heights[0], heights[1]];
+        let positive = [cell[0], cell[1], layer.quantum];
+        if !finite.iter().chain(&positive).all(|x| x.abs() < 1e12)
+            || !positive.iter().all(|x| *x > 0.0)
+            || !layer.finest_error.is_finite()
+        {
+            return Err(format!("layer '{name}': numbers beyond all measure"));
+        }
+    }
+    Ok(())
+}
+
+#[derive(Debug, Default)]
+pub(super) struct Counters {
+    bytes: AtomicU64,
+    requests: AtomicU64,
+    pub(super) round_trips: AtomicU64,
+    pub(super) errors: AtomicU64,
+    pub(super) cancelled: AtomicU64,
+}
+
+impl Counters {
+    pub(super) fn read(&self) -> Traffic {
+        let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        Traffic {
+            bytes: read(&self.bytes),
+            requests: read(&self.requests),
+            round_trips: read(&self.round_trips),
+            errors: read(&self.errors),
+            cancelled: read(&self.cancelled),
+        }
+    }
+}
+
+pub(super) fn count(counter: &AtomicU64, more: usize) {
+    counter.fetch_add(more as u64, Ordering::Relaxed);
+}
+
+/// The HTTP client, with its limits and counters.
+#[derive(Debug)]
+pub(super) struct Http {
+    pub(super) client: Client,
+    pub(super) base: String,
+    pub(super) traffic: Counters,
+}
+
+impl Http {
+    pub(super) async fn get(&self, route: &str) -> Result<Response, FetchError> {
+        count(&self.traffic.requests, 1);
+        let response =
+            self.client.get(format!("{}{route}", self.base)).send().await.map_err(|e| transport(&e))?;
+        if response.status() == StatusCode::OK {
+            return Ok(response);
+        }
+        let retry_after = response.headers().get("retry-after").and_then(|v| v.to_str().ok()?.parse().ok());
+        Err(FetchError::Status {
+            route: shortened(route),
+            status: response.status().as_u16(),
+            retry_after: retry_after.map(Duration::from_secs),
+        })
+    }
+
+    pub(super) async fn chunk(&self, response: &mut Response) -> Result<Option<Bytes>, FetchError> {
+        let chunk = response.chunk().await.map_err(|e| transport(&e))?;
+        count(&self.traffic.bytes, chunk.as_ref().map_or(0, Bytes::len));
+        Ok(chunk)
+    }
+
+    pub(super) async fn whole(&self, route: &str, limit: usize) -> Result<Vec<u8>, FetchError> {
+        let mut response = self.get(route).await?;
+        let mut body = Vec::new();
+        while let Some(chunk) = self.chunk(&mut response).await? {
+            if body.len() + chunk.len() > limit {
+                return Err(FetchError::TooLarge { route: shortened(route), limit });
+            }
+            body.extend_from_slice(&chunk);
+        }
+        Ok(body)
+    }
+
+    pub(super) async fn json<T: serde::de::DeserializeOwned>(&self, route: &str) -> Result<T, FetchError> {
+        let body = self.whole(route, JSON_BYTES_MAX).await?;
+        serde_json::from_slice(&body)
+            .map_err(|e| FetchError::Json { route: route.to_owned(), reason: e.to_string() })
+    }
+
+    /// The description of the scene of this name, or of the only one.
+    pub(super) async fn scene(&self, name: Option<&str>) -> Result<Scene, FetchError> {
+        count(&self.traffic.round_trips, 1);
+        let mut tries = 0;
+        let scene = loop {
+            let answer = match name {
+                Some(name) => self.json::<Scene>(&message::scene_route(name)).await,
+                None => self.json::<Catalogue>("/scenes").await.and_then(only),
+            };
+            tries += 1;
+            match answer {
+                Err(FetchError::Status { status: 429 | 500.., retry_after, .. }) if tries < TRIES_MAX => {
+                    count(&self.traffic.errors, 1);
+                    tokio::time::sleep(pause(tries, retry_after)).await;
+                }
+                answer => break answer?,
+            }
+        };
+        check(&scene).map_err(|reason| FetchError::Scene { scene: shortened(&scene.name), reason })?;
+        Ok(scene)
+    }
+}
+
+fn only(mut catalogue: Catalogue) -> Result<Scene, FetchError> {
+    match catalogue.scenes.pop() {
+        Some(scene) if catalogue.scenes.is_empty() => Ok(scene),
+        last => Err(FetchError::Choose(catalogue.scenes.into_iter().chain(last).map(|s| s.name).collect())),
+    }
+}
+
+/// The error with its causes: the outermost one alone says nothing.
+fn transport(error: &reqwest::Error) -> FetchError {
+    let mut text = error.to_string();
+    let mut cause = std::error::Error::source(error);
+    while let Some(next) = cause {
+        text = format!("{text}: {next}");
+        cause = next.source();
+    }
+    FetchError::Transport(text)
+}
+
+/// A route fit for a message: a batch's goes on for kilobytes.
+pub(super) fn shortened(route: &str) -> String {
+    route.chars().take(120).collect()
+}
+
+/// The pause after a number of failures in a row: doubling, and up to twice that by chance, so that many
+/// clients do not come back at once.
+pub(super) fn pause(tries: u32, asked: Option<Duration>) -> Duration {
+    let doubled = PAUSE.saturating_mul(1 << (tries.clamp(1, 16) - 1));
+    let chance = (std::hash::RandomState::new().hash_one(tries) % 1000) as f64 / 1000.0;
+    doubled.mul_f64(1.0 + chance).max(asked.unwrap_or_default()).min(PAUSE_MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::world::scene;
+
+    #[test]
+    fn addresses_of_servers_and_scenes_are_told_apart() {
+        let parse = |text| parse_address(text).map(|(url, name)| (url.to_string(), name));
+        let at = |base: &str, name: Option<&str>| (base.to_owned(), name.map(str::to_owned));
+        assert_eq!(parse("http://h:80/").unwrap(), at("http://h/", None));
+        assert_eq!(parse("http://h:8080").unwrap(), at("http://h:8080/", None));
+        assert_eq!(parse("http://h/scenes").unwrap(), at("http://h/", None));
+        assert_eq!(parse("http://h/scenes/alps/").unwrap(), at("http://h/", Some("alps")));
+        assert_eq!(parse("http://h/deep/scenes/alps?x#y").unwrap(), at("http://h/deep", Some("alps")));
+        for bad in ["", "h:80", "ftp://h/", "https://h/", "http://h/scenes/a/b/c", "http://h/scenes/.x"] {
+            assert!(matches!(parse(bad), Err(FetchError::Address { .. })), "{bad}");
+        }
+    }
+
+    #[test]
+    fn scenes_with_impossible_numbers_are_refused() {
+        assert_eq!(check(&scene(2)), Ok(()));
+        let with = |change: &dyn Fn(&mut Scene)| {
+            let mut scene = scene(2);
+            change(&mut scene);
+            check(&scene)
+        };
+        assert!(with(&|s| s.layers.clear()).is_err());
+        assert!(with(&|s| s.version = "../x".into()).is_err());
+        assert!(with(&|s| s.layers[1].name = "a/b".into()).is_err());
+        assert!(with(&|s| s.layers[0].quantum = 0.0).is_err());
+        assert!(with(&|s| s.layers[0].cell[1] = f64::NAN).is_err());
+        assert!(with(&|s| s.layers[0].origin[1] = 1e300).is_err());
+        assert!(with(&|s| s.layers[0].coding = s.layers[1].coding.clone()).is_err());
+    }
+
+    #[test]
+    fn several_scenes_are_listed() {
+        let catalogue =
+            Catalogue { scenes: ["a", "b"].map(|name| Scene { name: name.into(), ..scene(1) }).to_vec() };
+        let text = only(catalogue).unwrap_err().to_string();
+        assert!(text.ends_with("a, b"), "{text}");
+        assert!(only(Catalogue { scenes: Vec::new() }).is_err());
+    }
+
+    #[test]
+    fn pauses_double_within_bounds() {
+        for tries in 1..40 {
+            let paused = pause(tries, None);
+            let least = PAUSE.saturating_mul(1 << (tries - 1).min(12)).min(PAUSE_MAX);
+            assert!(paused >= least && paused <= (least * 2).min(PAUSE_MAX), "{tries}: {paused:?}");
+        }
+        assert_eq!(pause(1, Some(Duration::from_secs(3600))), PAUSE_MAX);
+        assert_eq!(pause(1, Some(Duration::from_secs(2))), Duration::from_secs(2));
+    }
+}

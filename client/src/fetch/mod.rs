@@ -1,0 +1,284 @@
+//! Requests: by priority, a few at a time, retried, dropped when nobody wants them any more.
+//!
+//! A frame tells what it wishes for, in order, and takes what has arrived; it never waits. The work is done
+//! by a few tasks on a runtime with threads of its own. Each takes the first wish that nobody is fetching:
+//! a page of the index, or as many diamonds as make a good batch. A batch is read frame by frame as its
+//! bytes arrive, so a slow answer gives its first diamonds early.
+//!
+//! **Nothing is fetched twice.** A frame's wishes may be older than the latest arrivals. So events are
+//! numbered, wishes say which event their author has seen, and what arrived since is not asked for again.
+//!
+//! **Whatever the server does**, an answer's size is limited before it is kept, each payload's checksum is
+//! verified, and a wish that fails [`TRIES_MAX`] times is reported and rests for [`REST`].
+//!
+//! | module | what it holds |
+//! |---|---|
+//! | `http` | addresses, answers and their limits, what goes over the wire |
+//! | `tasks` | the wishes and the tasks that fulfil them |
+//! | `stream` | what comes without being wished for, and when it ends |
+//! | `batch` | batches: put together, and cut from a stream of bytes |
+//! | `error` | why something was not fetched |
+
+mod batch;
+mod error;
+mod http;
+mod stream;
+mod tasks;
+
+#[cfg(test)]
+mod tests;
+
+pub use batch::ROOT_BYTES;
+pub use error::FetchError;
+pub use http::LAYERS_MAX;
+
+use bytes::Bytes;
+use diamantina_protocol::diamond::Diamond;
+use diamantina_protocol::index::Entry;
+use diamantina_protocol::message::{Scene, StreamAsk};
+use foldhash::fast::RandomState;
+use http::{Counters, Http, parse_address};
+use reqwest::Client;
+use std::collections::HashSet;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, mpsc};
+use std::time::Duration;
+use tasks::{Shared, work};
+use tokio::sync::Notify;
+
+/// Bytes of payloads asked for in one batch, where the index tells: about a second at 2 Mbit/s.
+pub const BATCH_BYTES: u64 = 256 << 10;
+
+/// The most wishes that are kept; the rest can wait for a later frame.
+pub const WISHES_MAX: usize = 8192;
+
+/// Failures in a row after which a wish is reported and rests. With the pauses between, some three seconds.
+pub const TRIES_MAX: u32 = 5;
+
+/// How long a wish rests that failed [`TRIES_MAX`] times.
+pub const REST: Duration = Duration::from_secs(20);
+
+/// Failures remembered; beyond, those that nobody wishes for are forgotten.
+const FAILURES_MAX: usize = 4 * WISHES_MAX;
+
+/// How to fetch.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Options {
+    /// Requests in flight at once, 1 to 64.
+    pub requests_max: usize,
+    /// How long a connection may be silent before the request is given up.
+    pub patience: Duration,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self { requests_max: 4, patience: Duration::from_secs(15) }
+    }
+}
+
+/// Something that can be fetched.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Key {
+    /// A page of a layer's index.
+    Page(usize, u32),
+    /// The payload of a layer's diamond.
+    Diamond(usize, Diamond),
+}
+
+/// Something to fetch.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Want {
+    /// What.
+    pub key: Key,
+    /// The payload's bytes, where the index tells; above 0.
+    pub bytes: Option<u32>,
+}
+
+/// What arrived.
+#[derive(Debug)]
+pub enum Event {
+    /// A page of a layer's index.
+    Page(usize, u32, Vec<(Diamond, Entry)>),
+    /// The payload of a layer's diamond; empty where the server has none and the index did not tell.
+    Payload(usize, Diamond, Bytes),
+    /// This has failed [`TRIES_MAX`] times in a row. It is tried again after [`REST`], if still wished for.
+    Failed(Key, FetchError),
+    /// The scene has another version now: open it again. Nothing more is fetched.
+    SceneChanged,
+}
+
+/// What has gone over the wire so far.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
+pub struct Traffic {
+    /// Bytes of answers, without their headers.
+    pub bytes: u64,
+    /// Requests sent.
+    pub requests: u64,
+    /// Requests sent while no other was in flight: how often the network's latency was paid.
+    pub round_trips: u64,
+    /// Requests that failed, in whole or in part.
+    pub errors: u64,
+    /// Requests dropped because nobody wanted the answer any more.
+    pub cancelled: u64,
+}
+
+/// Fetches a scene. Dropping it drops its requests, without waiting.
+///
+/// Holds the wishes and, for each request in flight, at most one payload or page beyond what is handed out.
+#[derive(Debug)]
+pub struct Fetcher {
+    shared: Arc<Shared>,
+    events: mpsc::Receiver<(u64, Event)>,
+    /// The last event that was taken.
+    seen: u64,
+    runtime: Option<tokio::runtime::Runtime>,
+}
+
+impl Fetcher {
+    /// Reads the scene's description, waiting for it, and starts. `url` is that of a scene,
+    /// `http://HOST:PORT/scenes/NAME`, or of a server with only one.
+    ///
+    /// # Errors
+    /// When there is no such scene, or it cannot be shown.
+    pub fn open(url: &str, options: Options) -> Result<(Self, Scene), FetchError> {
+        let (base, name) = parse_address(url)?;
+        let start = |e: &dyn std::fmt::Display| FetchError::Start(e.to_string());
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(2)
+            .thread_name("diamantina-fetch")
+            .enable_all()
+            .build()
+            .map_err(|e| start(&e))?;
+        let local = matches!(base.host_str(), Some("localhost" | "127.0.0.1" | "[::1]"));
+        let builder = Client::builder().connect_timeout(options.patience).read_timeout(options.patience);
+        let builder = if local { builder.no_proxy() } else { builder };
+        let http = Http {
+            client: builder.build().map_err(|e| start(&e))?,
+            base: base.as_str().trim_end_matches('/').to_owned(),
+            traffic: Counters::default(),
+        };
+        // Not block_on: the caller may stand in a runtime of its own.
+        let (sender, receiver) = mpsc::sync_channel(1);
+        runtime.spawn(async move {
+            let found = http.scene(name.as_deref()).await;
+            // Whoever asked waits for this.
+            let _ = sender.send((http, found));
+        });
+        let (http, scene) = receiver.recv().map_err(|e| start(&e))?;
+        let scene = match scene {
+            Ok(scene) => scene,
+            Err(e) => {
+                runtime.shutdown_background();
+                return Err(e);
+            }
+        };
+        let requests_max = options.requests_max.clamp(1, 64);
+        let (sender, events) = mpsc::channel();
+        let shared = Arc::new(Shared {
+            http,
+            scene: scene.clone(),
+            requests_max,
+            state: Mutex::default(),
+            changed: Notify::new(),
+            taken: Notify::new(),
+            waiting_bytes: AtomicUsize::new(0),
+            sender,
+        });
+        for _ in 0..requests_max {
+            runtime.spawn(work(Arc::clone(&shared)));
+        }
+        Ok((Self { shared, events, seen: 0, runtime: Some(runtime) }, scene))
+    }
+
+    /// The next event that has arrived, without waiting.
+    pub fn poll(&mut self) -> Option<Event> {
+        let (serial, event) = self.events.try_recv().ok()?;
+        self.seen = serial;
+        self.shared.waiting_bytes.fetch_sub(stream::weight(&event), Ordering::Relaxed);
+        self.shared.taken.notify_waiters();
+        Some(event)
+    }
+
+    /// Replaces the wishes, most urgent first, of which at most [`WISHES_MAX`] count. Requests of which
+    /// nothing is wished for any more are dropped.
+    pub fn wish(&mut self, mut wishes: Vec<Want>) {
+        wishes.truncate(WISHES_MAX);
+        let mut state = self.shared.lock();
+        let seen = self.seen;
+        state.delivered.retain(|_, serial| *serial > seen);
+        if wishes.is_empty() && state.wishes.is_empty() {
+            return;
+        }
+        if state.wishes != wishes {
+            let wished: HashSet<Key, RandomState> = wishes.iter().map(|want| want.key).collect();
+            let wanted: HashSet<u64> =
+                state.flying.iter().filter(|(key, _)| wished.contains(key)).map(|(_, id)| *id).collect();
+            for (_, flight) in
+                state.flights.iter().filter(|(id, f)| f.stream.is_none() && !wanted.contains(id))
+            {
+                flight.cancel.notify_one();
+            }
+            if state.failures.len() > FAILURES_MAX {
+                state.failures.retain(|key, _| wished.contains(key));
+            }
+            state.wishes = wishes;
+        }
+        drop(state);
+        self.shared.changed.notify_waiters();
+    }
+
+    /// Asks for what is worth the most, in one request of its own, ahead of all wishes. While it is under way,
+    /// wishes for its layer rest. It replaces the layer's last one.
+    pub fn stream(&mut self, layer: usize, ask: StreamAsk) {
+        let mut state = self.shared.lock();
+        state.end_streams(|other| other == layer);
+        state.streams.push_back((layer, ask));
+        drop(state);
+        self.shared.changed.notify_waiters();
+    }
+
+    /// Drops all streams. What has arrived of them stays.
+    pub fn end_streams(&mut self) {
+        self.shared.lock().end_streams(|_| true);
+        self.shared.changed.notify_waiters();
+    }
+
+    /// Whether a stream is under way, or about to be.
+    #[must_use]
+    pub fn is_streaming(&self) -> bool {
+        let state = self.shared.lock();
+        !state.streams.is_empty() || state.flights.values().any(|flight| flight.stream.is_some())
+    }
+
+    /// Says that what arrived for `key` was no good. It is fetched again, after a pause.
+    pub fn refuse(&mut self, key: Key, error: &FetchError) {
+        let mut state = self.shared.lock();
+        state.delivered.remove(&key);
+        self.shared.fail(&mut state, &[key], error);
+    }
+
+    /// Whether all that is wished for has failed too often and rests.
+    #[must_use]
+    pub fn is_stuck(&self) -> bool {
+        let state = self.shared.lock();
+        let rests = |want: &Want| state.failures.get(&want.key).is_some_and(|f| f.tries >= TRIES_MAX);
+        state.flights.is_empty()
+            && state.streams.is_empty()
+            && !state.wishes.is_empty()
+            && state.wishes.iter().all(rests)
+    }
+
+    /// What has gone over the wire so far.
+    #[must_use]
+    pub fn traffic(&self) -> Traffic {
+        self.shared.http.traffic.read()
+    }
+}
+
+impl Drop for Fetcher {
+    fn drop(&mut self) {
+        if let Some(runtime) = self.runtime.take() {
+            runtime.shutdown_background();
+        }
+    }
+}

@@ -1,0 +1,360 @@
+//! The wishes, and the tasks that fulfil them: each takes the most urgent that nobody is fetching.
+
+use super::batch::{Batch, Frames};
+use super::http::{Http, PAGE_BYTES_MAX, count, pause, shortened};
+use super::stream::weight;
+use super::{Event, FetchError, Key, REST, TRIES_MAX, Want};
+use bytes::Bytes;
+use diamantina_protocol::diamond::Diamond;
+use diamantina_protocol::index;
+use diamantina_protocol::message::{self, FrameHeader, Scene, Status, StreamAsk};
+use foldhash::fast::RandomState;
+use std::collections::{HashMap, VecDeque};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
+use std::time::Instant;
+use tokio::sync::Notify;
+
+#[derive(Debug)]
+pub(super) struct Shared {
+    pub(super) http: Http,
+    pub(super) scene: Scene,
+    pub(super) requests_max: usize,
+    // A std Mutex: nothing awaits while it is held, nor does more than look through the wishes.
+    pub(super) state: Mutex<State>,
+    pub(super) changed: Notify,
+    /// Tells streams that an event has been taken.
+    pub(super) taken: Notify,
+    /// Bytes of events that no frame has taken yet.
+    pub(super) waiting_bytes: AtomicUsize,
+    pub(super) sender: mpsc::Sender<(u64, Event)>,
+}
+
+#[derive(Debug, Default)]
+pub(super) struct State {
+    pub(super) wishes: Vec<Want>,
+    /// Streams that have not begun: at most one a layer.
+    pub(super) streams: VecDeque<(usize, StreamAsk)>,
+    pub(super) flights: HashMap<u64, Flight>,
+    /// What requests in flight still owe, with the request's number.
+    pub(super) flying: HashMap<Key, u64, RandomState>,
+    /// What arrived, with the number of its event, until the frame has seen it.
+    pub(super) delivered: HashMap<Key, u64, RandomState>,
+    pub(super) failures: HashMap<Key, Failure, RandomState>,
+    /// Events and requests so far.
+    serial: u64,
+    flight: u64,
+    stopped: bool,
+}
+
+#[derive(Debug)]
+pub(super) struct Flight {
+    pub(super) cancel: Arc<Notify>,
+    is_page: bool,
+    /// The layer, if it is a stream.
+    pub(super) stream: Option<usize>,
+    /// Whether something of it has arrived.
+    useful: bool,
+}
+
+#[derive(Debug)]
+pub(super) struct Failure {
+    pub(super) tries: u32,
+    not_before: Instant,
+}
+
+/// What a task does next.
+enum Next {
+    Fetch { id: u64, cancel: Arc<Notify>, request: Request },
+    Wait(Option<Instant>),
+}
+
+enum Request {
+    Page(usize, u32),
+    Batch(usize, Vec<(Diamond, Option<u32>)>),
+    Stream(usize, StreamAsk),
+}
+
+impl State {
+    /// Drops the streams of some layers.
+    pub(super) fn end_streams(&mut self, of: impl Fn(usize) -> bool) {
+        self.streams.retain(|(layer, _)| !of(*layer));
+        for flight in self.flights.values().filter(|flight| flight.stream.is_some_and(&of)) {
+            flight.cancel.notify_one();
+        }
+    }
+
+    /// Whether a layer's wishes rest, since a stream may bring them.
+    fn rests(&self, layer: usize) -> bool {
+        let flies = |flight: &Flight| flight.stream == Some(layer);
+        self.streams.iter().any(|(l, _)| *l == layer) || self.flights.values().any(flies)
+    }
+}
+
+/// One of the tasks that fetch.
+pub(super) async fn work(shared: Arc<Shared>) {
+    loop {
+        // Before looking, so that no change is missed.
+        let mut changed = std::pin::pin!(shared.changed.notified());
+        changed.as_mut().enable();
+        match shared.next() {
+            Next::Wait(None) => changed.await,
+            Next::Wait(Some(until)) => {
+                let _ = tokio::time::timeout_at(until.into(), changed).await;
+            }
+            Next::Fetch { id, cancel, request } => {
+                let done = tokio::select! {
+                    done = shared.fetch(&request) => Some(done),
+                    () = cancel.notified() => None,
+                };
+                let gone = matches!(&done, Some(Err(FetchError::Status { status: 404 | 410, .. })));
+                if gone && shared.is_replaced().await {
+                    shared.stop();
+                    return;
+                }
+                shared.land(id, done);
+            }
+        }
+    }
+}
+
+impl Shared {
+    pub(super) fn lock(&self) -> MutexGuard<'_, State> {
+        // A panic elsewhere is no reason for one here: the state is whole between any two statements.
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The most urgent request that may be sent now.
+    fn next(&self) -> Next {
+        let mut guard = self.lock();
+        let state = &mut *guard;
+        if state.stopped {
+            return Next::Wait(None);
+        }
+        let now = Instant::now();
+        let mut soonest: Option<Instant> = None;
+        let mut page = None;
+        let mut batch: Option<Batch> = None;
+        let stream = state.streams.pop_front();
+        let resting: Vec<bool> = (0..self.scene.layers.len()).map(|layer| state.rests(layer)).collect();
+        let wishes = if stream.is_none() { state.wishes.as_slice() } else { &[] };
+        for want in wishes {
+            let (Key::Page(layer, _) | Key::Diamond(layer, _)) = want.key;
+            if resting[layer]
+                || state.flying.contains_key(&want.key)
+                || state.delivered.contains_key(&want.key)
+            {
+                continue;
+            }
+            if let Some(failure) = state.failures.get(&want.key).filter(|f| f.not_before > now) {
+                soonest = Some(soonest.map_or(failure.not_before, |s| s.min(failure.not_before)));
+                continue;
+            }
+            match want.key {
+                Key::Page(layer, number) => {
+                    page.get_or_insert((layer, number, batch.is_none()));
+                }
+                Key::Diamond(layer, d) => {
+                    let batch = batch.get_or_insert_with(|| Batch::new(&self.http.base, &self.scene, layer));
+                    if batch.layer == layer && !batch.push(d, want.bytes) {
+                        break;
+                    }
+                }
+            }
+        }
+        // Of several tasks, one is left for diamonds: pages alone draw nothing.
+        let pages = state.flights.values().filter(|flight| flight.is_page).count();
+        let request = match (page, batch, stream) {
+            (_, _, Some((layer, ask))) => Request::Stream(layer, ask),
+            (Some((layer, number, first)), batch, None)
+                if batch.is_none() || (first && pages + 1 < self.requests_max) =>
+            {
+                Request::Page(layer, number)
+            }
+            (_, Some(batch), None) => Request::Batch(batch.layer, batch.wants),
+            _ => return Next::Wait(soonest),
+        };
+        if state.flights.is_empty() {
+            count(&self.http.traffic.round_trips, 1);
+        }
+        state.flight += 1;
+        let id = state.flight;
+        match &request {
+            Request::Page(layer, number) => {
+                state.flying.insert(Key::Page(*layer, *number), id);
+            }
+            Request::Batch(layer, wants) => {
+                state.flying.extend(wants.iter().map(|(d, _)| (Key::Diamond(*layer, *d), id)));
+            }
+            Request::Stream(..) => {}
+        }
+        let cancel = Arc::new(Notify::new());
+        let is_page = matches!(request, Request::Page(..));
+        let stream = if let Request::Stream(layer, _) = &request { Some(*layer) } else { None };
+        state.flights.insert(id, Flight { cancel: Arc::clone(&cancel), is_page, stream, useful: false });
+        Next::Fetch { id, cancel, request }
+    }
+
+    async fn fetch(&self, request: &Request) -> Result<(), FetchError> {
+        let Scene { name, version, layers, .. } = &self.scene;
+        match request {
+            Request::Page(layer, number) => {
+                let layer_of = &layers[*layer];
+                let route = message::index_route(name, version, &layer_of.name, *number);
+                let body = self.http.whole(&route, PAGE_BYTES_MAX).await?;
+                // Stops at the limit, whatever the bytes claim to become.
+                let page = zstd::bulk::decompress(&body, PAGE_BYTES_MAX)
+                    .map_err(|_| FetchError::Compression(*number))?;
+                let entries = index::decode(&layer_of.forest, *number, &page)?;
+                self.deliver(Key::Page(*layer, *number), Event::Page(*layer, *number, entries));
+                Ok(())
+            }
+            Request::Batch(layer, wants) => {
+                let centres: Vec<_> = wants.iter().map(|(d, _)| d.centre()).collect();
+                let route = message::batch_route(name, version, &layers[*layer].name, &centres);
+                let mut response = self.http.get(&route).await?;
+                let mut owed: HashMap<[u32; 2], (Diamond, Option<u32>)> =
+                    wants.iter().map(|want| (want.0.centre(), *want)).collect();
+                let mut frames = Frames::default();
+                let mut bad = None;
+                while let Some(chunk) = self.http.chunk(&mut response).await? {
+                    frames.push(&chunk);
+                    while let Some((header, payload)) = frames.take()? {
+                        let centre = header.centre;
+                        let (d, bytes) = owed.remove(&centre).ok_or(FetchError::Unasked(centre))?;
+                        // A bad payload is still owed; the others are none the worse.
+                        bad = self.receive(*layer, d, bytes, &header, payload).err().or(bad);
+                    }
+                }
+                match bad {
+                    Some(error) => Err(error),
+                    None if owed.is_empty() => Ok(()),
+                    None => Err(FetchError::Early(shortened(&route))),
+                }
+            }
+            Request::Stream(layer, ask) => self.stream(*layer, ask).await,
+        }
+    }
+
+    /// Takes one payload of a batch, and hands it on if it is good.
+    fn receive(
+        &self,
+        layer: usize,
+        d: Diamond,
+        bytes: Option<u32>,
+        header: &FrameHeader,
+        payload: Bytes,
+    ) -> Result<(), FetchError> {
+        match header.status {
+            Status::Ok if header.checksum != message::checksum(&payload) => {
+                return Err(FetchError::Damaged(d.centre()));
+            }
+            Status::Ok if bytes.is_some_and(|b| b != header.length) => {
+                return Err(FetchError::Damaged(d.centre()));
+            }
+            // The index was not there to tell that there is none.
+            Status::Missing if bytes.is_none() && header.length == 0 => {}
+            Status::Missing | Status::Damaged => return Err(FetchError::Missing(d.centre())),
+            Status::Page => return Err(FetchError::Unasked(d.centre())),
+            Status::Ok => {}
+        }
+        self.deliver(Key::Diamond(layer, d), Event::Payload(layer, d, payload));
+        Ok(())
+    }
+
+    pub(super) fn waiting_bytes(&self) -> usize {
+        self.waiting_bytes.load(Ordering::Relaxed)
+    }
+
+    pub(super) fn deliver(&self, key: Key, event: Event) {
+        let mut state = self.lock();
+        if let Some(id) = state.flying.remove(&key)
+            && let Some(flight) = state.flights.get_mut(&id)
+        {
+            flight.useful = true;
+        }
+        state.failures.remove(&key);
+        state.serial += 1;
+        let serial = state.serial;
+        state.delivered.insert(key, serial);
+        self.waiting_bytes.fetch_add(weight(&event), Ordering::Relaxed);
+        // Nobody listens any more when the fetcher is dropped.
+        let _ = self.sender.send((serial, event));
+    }
+
+    /// Puts wishes that failed together off, and reports those that have failed too often. One pause serves
+    /// them all, or else a batch that failed would come back as many.
+    pub(super) fn fail(&self, state: &mut State, keys: &[Key], error: &FetchError) {
+        count(&self.http.traffic.errors, 1);
+        let asked = if let FetchError::Status { retry_after, .. } = error { *retry_after } else { None };
+        let tries = |key: &Key| state.failures.get(key).map_or(0, |failure| failure.tries);
+        let now = Instant::now();
+        let again = now + pause(1 + keys.iter().map(tries).max().unwrap_or(0), asked);
+        for key in keys {
+            self.fail_one(state, *key, error, now, again);
+        }
+    }
+
+    fn fail_one(&self, state: &mut State, key: Key, error: &FetchError, now: Instant, again: Instant) {
+        let failure = state.failures.entry(key).or_insert(Failure { tries: 0, not_before: now });
+        // A wish that has rested rests again at once.
+        failure.tries = (failure.tries + 1).min(TRIES_MAX);
+        let rest = failure.tries == TRIES_MAX;
+        failure.not_before = if rest { now + REST } else { again };
+        if rest {
+            state.serial += 1;
+            // As above.
+            let _ = self.sender.send((state.serial, Event::Failed(key, error.clone())));
+        }
+    }
+
+    /// Ends a request; `done` is `None` if it was dropped.
+    fn land(&self, id: u64, done: Option<Result<(), FetchError>>) {
+        let mut state = self.lock();
+        let useful = state.flights.remove(&id).is_some_and(|flight| flight.useful);
+        let owed: Vec<Key> = state.flying.iter().filter(|(_, f)| **f == id).map(|(key, _)| *key).collect();
+        for key in &owed {
+            state.flying.remove(key);
+        }
+        match done {
+            None => count(&self.http.traffic.cancelled, 1),
+            Some(Ok(())) => {}
+            // Cut off, but not in vain: what it owes has not failed in itself.
+            Some(Err(FetchError::Early(_) | FetchError::Transport(_))) if useful => {
+                count(&self.http.traffic.errors, 1);
+                let not_before = Instant::now() + pause(1, None);
+                for key in owed {
+                    state.failures.entry(key).or_insert(Failure { tries: 0, not_before }).not_before =
+                        not_before;
+                }
+            }
+            Some(Err(error)) => {
+                self.fail(&mut state, &owed, &error);
+            }
+        }
+        drop(state);
+        self.changed.notify_waiters();
+    }
+
+    /// Whether the scene is gone or has another version, so that nothing under this one can be had.
+    async fn is_replaced(&self) -> bool {
+        match self.http.json::<Scene>(&message::scene_route(&self.scene.name)).await {
+            Ok(scene) => scene.version != self.scene.version,
+            Err(FetchError::Status { status: 404 | 410, .. }) => true,
+            Err(_) => false,
+        }
+    }
+
+    fn stop(&self) {
+        let mut state = self.lock();
+        if !state.stopped {
+            state.stopped = true;
+            state.flights.clear();
+            state.flying.clear();
+            state.streams.clear();
+            state.serial += 1;
+            // As above.
+            let _ = self.sender.send((state.serial, Event::SceneChanged));
+        }
+    }
+}

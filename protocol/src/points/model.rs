@@ -1,0 +1,624 @@
+//! What a scene's numbers look like: kernels that predict heights, and tables of how large a difference is
+//! likely to be.
+//!
+//! A model is small and goes with the scene's description, so that no diamond pays for learning it. Every
+//! parameter is a whole number of fixed scale; from them both ends compute the same probabilities.
+//!
+//! **Classes.** The neighbourhood of a new point gives an *activity*, the difference to be expected in
+//! steps. Two classes an octave of activity each have a table of their own: the probability of magnitude
+//! 0, and of each larger one given that it is not smaller (a *hazard*). Eight hazards describe a table.
+//! Signs are taken as even: both have half of a magnitude's share, so sign and magnitude are one symbol.
+//! Where large numbers are usual, their low bits are as good as random and are sent plainly.
+
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    reason = "classes, symbols and shares are below 2^13, magnitudes below 2^27; casts keep them in place"
+)]
+
+use crate::rans::{Decoder, Encoder, PLAIN_MAX, PRECISION, TOTAL};
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+/// Activity classes of numbers.
+pub const CLASSES: usize = 40;
+
+/// The activity of the first class is 2^-OCTAVES_BELOW.
+const OCTAVES_BELOW: u32 = 8;
+
+/// Classes of corrections: tilt towards one side, times roughness.
+pub const CORRECTION_CLASSES: usize = TILTS * ROUGHNESSES;
+/// Kinds of tilt of a correction.
+pub const TILTS: usize = 6;
+/// Kinds of roughness of a correction.
+pub const ROUGHNESSES: usize = 3;
+
+/// Hazards of a table.
+pub const HAZARDS: usize = 8;
+
+/// The magnitudes that have a hazard in common: from this one up to the next.
+const HAZARD_FROM: [usize; HAZARDS] = [0, 1, 2, 3, 4, 6, 9, 14];
+
+/// The largest magnitude with symbols of its own.
+const DIRECT_MAX: usize = 31;
+
+/// Symbols are magnitudes with sign, from -31 to 31, then the escape.
+const SYMBOLS: usize = 2 * DIRECT_MAX + 2;
+const ZERO: usize = DIRECT_MAX;
+const ESCAPE: usize = SYMBOLS - 1;
+
+/// Bits that say how long an escaped magnitude is.
+const LENGTH_BITS: u32 = 5;
+
+/// Weights of kernels and activities are whole numbers of this part.
+const WEIGHT: f32 = 1.0 / 4096.0;
+
+/// Weights of causal neighbours are whole numbers of 2^-CAUSAL_BITS.
+pub const CAUSAL_BITS: u32 = 8;
+
+/// How the new points of a level are predicted, in one of the two ways in which a local grid lies on the
+/// lattice (turned by a half or a quarter).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Kernel {
+    /// Weights, in 1/4096, of what the pairs of opposite old points around a cell differ from the mean of
+    /// the nearest four; the first one weighs the difference between the two pairs of nearest.
+    pub pairs: [i16; PAIRS],
+    /// Weights, in 1/256, of what was missing at the new points to the south, south-west, south-east and
+    /// west.
+    pub causal: [i16; 4],
+    /// Weights, in 1/4096, of the cell's twist, the second differences at its corners, its spread, the
+    /// numbers in the row below, and a constant: together the activity.
+    pub activity: [i16; 5],
+}
+
+/// Pairs of a kernel; see `rows`.
+pub const PAIRS: usize = 7;
+
+impl Default for Kernel {
+    /// The quincunx interpolation of Neville type (Kovacevic and Sweldens 2000): (10 * sum of the 4 nearest
+    /// - sum of the 8 next) / 32; and activities as they are on average on terrain.
+    fn default() -> Self {
+        Self {
+            pairs: [0, 0, 0, -128, -128, -128, -128],
+            causal: [0, 0, 0, 0],
+            activity: [60, 40, 40, 120, 900],
+        }
+    }
+}
+
+impl Kernel {
+    /// The weights of pairs as numbers.
+    #[must_use]
+    pub fn pairs(&self) -> [f32; PAIRS] {
+        self.pairs.map(|w| f32::from(w) * WEIGHT)
+    }
+
+    /// The weights of the activity as numbers.
+    #[must_use]
+    pub fn activity(&self) -> [f32; 5] {
+        self.activity.map(|w| f32::from(w) * WEIGHT)
+    }
+}
+
+/// The model of a layer.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "ModelParts", into = "ModelParts")]
+pub struct Model {
+    /// Kernels by level; beyond the last one, that of the same parity before it.
+    levels: Vec<[Kernel; 2]>,
+    numbers: [[u16; HAZARDS]; CLASSES],
+    corrections: [[u16; 2]; CORRECTION_CLASSES],
+    tables: Arc<Tables>,
+}
+
+#[derive(Clone, Serialize, Deserialize)]
+struct ModelParts {
+    levels: Vec<[Kernel; 2]>,
+    numbers: Vec<[u16; HAZARDS]>,
+    corrections: Vec<[u16; 2]>,
+}
+
+/// Why numbers are not a model.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ModelError {
+    /// A list is not as long as it has to be.
+    #[error("model with {found} {what}: expected {expected}; reload the scene")]
+    Count {
+        /// What is counted.
+        what: &'static str,
+        /// How many there are.
+        found: usize,
+        /// How many there have to be.
+        expected: usize,
+    },
+    /// A hazard is no probability.
+    #[error("hazard {0}: expected 1 to {max}; reload the scene", max = TOTAL - 1)]
+    Hazard(u16),
+}
+
+impl TryFrom<ModelParts> for Model {
+    type Error = ModelError;
+    fn try_from(p: ModelParts) -> Result<Self, ModelError> {
+        let count = |what, found, expected| ModelError::Count { what, found, expected };
+        if p.levels.is_empty() || p.levels.len() > 64 {
+            return Err(count("levels", p.levels.len(), 64));
+        }
+        let numbers = <[_; CLASSES]>::try_from(p.numbers);
+        let numbers = numbers.map_err(|v| count("classes of numbers", v.len(), CLASSES))?;
+        let corrections = <[_; CORRECTION_CLASSES]>::try_from(p.corrections);
+        let corrections =
+            corrections.map_err(|v| count("classes of corrections", v.len(), CORRECTION_CLASSES))?;
+        let all = numbers.iter().flatten().chain(corrections.iter().flatten());
+        if let Some(bad) = all.copied().find(|h| !(1..TOTAL as u16).contains(h)) {
+            return Err(ModelError::Hazard(bad));
+        }
+        Ok(Self::new(p.levels, numbers, corrections))
+    }
+}
+
+impl From<Model> for ModelParts {
+    fn from(m: Model) -> Self {
+        Self { levels: m.levels, numbers: m.numbers.to_vec(), corrections: m.corrections.to_vec() }
+    }
+}
+
+impl Default for Model {
+    fn default() -> Self {
+        let numbers = std::array::from_fn(default_hazards);
+        // A correction is one of three: even odds first, then two to one for the nearer side.
+        let corrections = std::array::from_fn(|c| {
+            let tilt = (c % TILTS) as u16;
+            [1400, 2048 + 200 * tilt]
+        });
+        Self::new(vec![[Kernel::default(); 2]], numbers, corrections)
+    }
+}
+
+impl Model {
+    /// From kernels (at least one level), hazards by class, and those of corrections; hazards in
+    /// 1..[`TOTAL`].
+    #[must_use]
+    pub fn new(
+        levels: Vec<[Kernel; 2]>,
+        numbers: [[u16; HAZARDS]; CLASSES],
+        corrections: [[u16; 2]; CORRECTION_CLASSES],
+    ) -> Self {
+        let tables = Arc::new(Tables::new(&numbers, &corrections));
+        Self { levels, numbers, corrections, tables }
+    }
+
+    /// With these kernels and hazards that know nothing of the layer.
+    #[must_use]
+    pub fn of_kernels(levels: Vec<[Kernel; 2]>) -> Self {
+        Self { levels, ..Self::default() }
+    }
+
+    /// The kernel of a level in one of the two ways.
+    #[must_use]
+    pub fn kernel(&self, level: u32, way: usize) -> &Kernel {
+        let (level, last) = (level as usize, self.levels.len() - 1);
+        let at = if level <= last { level } else { last - usize::from((level - last) % 2 == 1 && last > 0) };
+        &self.levels[at][way]
+    }
+
+    /// The tables that the hazards give.
+    #[must_use]
+    pub fn tables(&self) -> &Tables {
+        &self.tables
+    }
+
+    /// The kernels by level.
+    #[must_use]
+    pub fn levels(&self) -> &[[Kernel; 2]] {
+        &self.levels
+    }
+}
+
+/// The class of an activity; anything is allowed, NaN and infinities too.
+#[inline]
+#[must_use]
+pub fn class(activity: f32) -> u8 {
+    const LEAST: f32 = 1.0 / (1 << OCTAVES_BELOW) as f32;
+    const MOST: f32 = (1 << (CLASSES as u32 / 2 - OCTAVES_BELOW)) as f32 * 0.999;
+    // The exponent and the first bit behind the point of a float: two classes an octave.
+    const BASE: u32 = LEAST.to_bits() >> 22;
+    let activity = if activity > LEAST { activity } else { LEAST };
+    let activity = if activity < MOST { activity } else { MOST };
+    ((activity.to_bits() >> 22) - BASE) as u8
+}
+
+/// The least activity of a class, in sixteenths of 2^-OCTAVES_BELOW.
+fn class_from(class: usize) -> u64 {
+    (2 + class as u64 % 2) << (class / 2 + 3)
+}
+
+/// How many low bits of the numbers of a class are sent plainly.
+fn class_shift(class: usize) -> u32 {
+    // Bins of a quarter of the activity: eight of them hold most numbers.
+    (class as u32 / 2).saturating_sub(OCTAVES_BELOW + 2)
+}
+
+/// Hazards of a class of which nothing is known: those of a geometric distribution whose mean magnitude is
+/// the activity.
+fn default_hazards(class: usize) -> [u16; HAZARDS] {
+    // The middle of the class, in units of 2^-12 bins.
+    let mean = (class_from(class) * 5 / 4) >> class_shift(class);
+    let hazard = (1u64 << 24) / (mean + 4096);
+    [hazard.clamp(1, u64::from(TOTAL) - 1) as u16; HAZARDS]
+}
+
+/// The group of magnitudes that share a hazard.
+fn hazard_group(magnitude: usize) -> usize {
+    HAZARD_FROM.partition_point(|from| *from <= magnitude) - 1
+}
+
+/// One class's shares, and the way back from a share to its symbol.
+#[derive(Clone, PartialEq, Eq)]
+struct Table {
+    /// The symbol of each of the [`TOTAL`] slots.
+    symbol: [u8; TOTAL as usize],
+    /// Start and share of each symbol: `start << 16 | share`.
+    range: [u32; SYMBOLS],
+    /// Low bits that are sent plainly.
+    shift: u32,
+    /// The largest magnitude that has symbols here.
+    direct: u32,
+}
+
+impl Table {
+    /// From shares of symbols that sum to [`TOTAL`].
+    fn from_shares(shares: &[u32; SYMBOLS], shift: u32, direct: u32) -> Self {
+        let mut table = Self { symbol: [0; TOTAL as usize], range: [0; SYMBOLS], shift, direct };
+        let mut start = 0;
+        for (symbol, share) in shares.iter().enumerate() {
+            table.range[symbol] = start << 16 | share;
+            table.symbol[start as usize..(start + share) as usize].fill(symbol as u8);
+            start += share;
+        }
+        table
+    }
+
+    fn of_numbers(hazards: &[u16; HAZARDS], shift: u32) -> Self {
+        let mut shares = [0u32; SYMBOLS];
+        // What is left of the probabilities, in 2^-28.
+        let mut left = u64::from(TOTAL) << 16;
+        let mut used = 0;
+        let mut direct = 0;
+        for magnitude in 0..=DIRECT_MAX {
+            let part = (left * u64::from(hazards[hazard_group(magnitude)])) >> PRECISION;
+            let share = if magnitude == 0 { part >> 16 } else { (part + (1 << 16)) >> 17 } as u32;
+            // The escape keeps a share, however unlikely it is.
+            let room = TOTAL - 1 - used;
+            let share = if magnitude == 0 { share.clamp(1, room) } else { share.min(room / 2) };
+            if share == 0 {
+                break;
+            }
+            let both = if magnitude == 0 { share } else { 2 * share };
+            if magnitude == 0 {
+                shares[ZERO] = both;
+            } else {
+                shares[ZERO + magnitude] = share;
+                shares[ZERO - magnitude] = share;
+            }
+            used += both;
+            left -= part;
+            direct = magnitude as u32;
+        }
+        let escape = ((left + (1 << 15)) >> 16).clamp(1, u64::from(TOTAL - used)) as u32;
+        shares[ESCAPE] = escape;
+        // What rounding left over goes to zero, which is the largest or near to it.
+        shares[ZERO] += TOTAL - used - escape;
+        Self::from_shares(&shares, shift, direct)
+    }
+
+    fn of_corrections([zero, nearer]: [u16; 2]) -> Self {
+        let zero = u32::from(zero).min(TOTAL - 2);
+        let rest = TOTAL - zero;
+        let nearer = ((rest * u32::from(nearer)) >> PRECISION).clamp(1, rest - 1);
+        let mut shares = [0u32; SYMBOLS];
+        (shares[ZERO], shares[ZERO + 1], shares[ZERO - 1]) = (zero, nearer, rest - nearer);
+        Self::from_shares(&shares, 0, 1)
+    }
+}
+
+/// The tables of a model: those of numbers by class, then those of corrections. Takes 4.4 kB a class.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Tables(Vec<Table>);
+
+impl std::fmt::Debug for Tables {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Tables of {} classes", self.0.len())
+    }
+}
+
+/// The class of a correction among all classes.
+#[must_use]
+pub fn correction_class(tilt: u8, roughness: u8) -> u8 {
+    CLASSES as u8 + roughness * TILTS as u8 + tilt
+}
+
+impl Tables {
+    fn new(numbers: &[[u16; HAZARDS]; CLASSES], corrections: &[[u16; 2]; CORRECTION_CLASSES]) -> Self {
+        let numbers = numbers.iter().enumerate().map(|(c, h)| Table::of_numbers(h, class_shift(c)));
+        Self(numbers.chain(corrections.iter().map(|c| Table::of_corrections(*c))).collect())
+    }
+
+    /// Appends a number, of magnitude below 2^27, under its class.
+    pub fn encode(&self, coder: &mut Encoder, lane: u8, class: u8, value: i32) {
+        let table = &self.0[usize::from(class)];
+        // Bins are centred on zero.
+        let half = (1 << table.shift) >> 1;
+        let bin = (value + half) >> table.shift;
+        let magnitude = bin.unsigned_abs();
+        let put = |coder: &mut Encoder, symbol: usize| {
+            let range = table.range[symbol];
+            coder.symbol(lane, (range >> 16) as u16, range as u16);
+        };
+        if magnitude <= table.direct {
+            put(coder, (ZERO as i32 + bin) as usize);
+        } else {
+            put(coder, ESCAPE);
+            let excess = magnitude - table.direct;
+            let below = excess.ilog2();
+            coder.plain(lane, (below << 1 | u32::from(bin < 0)) as u16, LENGTH_BITS + 1);
+            plain_long(coder, lane, excess ^ 1 << below, below);
+        }
+        if table.shift > 0 {
+            plain_long(coder, lane, ((value + half) & ((1 << table.shift) - 1)).cast_unsigned(), table.shift);
+        }
+    }
+
+    /// Reads as many numbers as there are classes, the lanes taking turns.
+    ///
+    /// A damaged payload gives numbers of no meaning, of magnitude below 2^31.
+    #[inline]
+    pub fn decode(&self, coder: &mut Decoder, classes: &[u8], numbers: &mut [i32]) {
+        if coder.lanes() == 2 {
+            self.decode_in::<2>(coder, classes, numbers)
+        } else {
+            self.decode_in::<1>(coder, classes, numbers)
+        }
+    }
+
+    fn decode_in<const LANES: usize>(&self, coder: &mut Decoder, classes: &[u8], numbers: &mut [i32]) {
+        // A copy, so that states and place stay in registers.
+        let mut local = *coder;
+        let mut states = local.states();
+        for (classes, numbers) in classes.chunks(LANES).zip(numbers.chunks_mut(LANES)) {
+            for (lane, (class, number)) in classes.iter().zip(numbers).enumerate() {
+                let Some(table) = self.0.get(usize::from(*class)) else { continue };
+                let state = states[lane];
+                let slot = state % TOTAL;
+                let symbol = table.symbol[slot as usize];
+                let range = table.range[usize::from(symbol & (SYMBOLS as u8 - 1))];
+                let (start, share) = (range >> 16, range & 0xffff);
+                let state = local.refill(share * (state >> PRECISION) + slot - start);
+                let bin = i32::from(symbol) - ZERO as i32;
+                if usize::from(symbol) == ESCAPE {
+                    (*number, states[lane], local) = table.escaped(local, state);
+                } else if table.shift > 0 {
+                    let (low, state) = local.plain_of(state, table.shift);
+                    (*number, states[lane]) = (table.whole(bin, low), state);
+                } else {
+                    (*number, states[lane]) = (bin, state);
+                }
+            }
+        }
+        local.set_states(states);
+        *coder = local;
+    }
+}
+
+impl Table {
+    /// The number of a bin and the low bits in it.
+    #[inline(always)]
+    fn whole(&self, bin: i32, low: u32) -> i32 {
+        let half = (1 << self.shift) >> 1;
+        (bin.wrapping_shl(self.shift) | low.cast_signed()).wrapping_sub(half)
+    }
+
+    /// The number behind an escape.
+    #[cold]
+    #[inline(never)]
+    fn escaped<'a>(&self, mut coder: Decoder<'a>, state: u32) -> (i32, u32, Decoder<'a>) {
+        let (kind, state) = coder.plain_of(state, LENGTH_BITS + 1);
+        // 26 bits are the most that an encoder writes.
+        let below = (kind >> 1).min(26);
+        let (excess, state) = plain_long_of(&mut coder, state, below);
+        let magnitude = ((1 << below | excess) + self.direct).cast_signed();
+        let bin = if kind & 1 == 1 { -magnitude } else { magnitude };
+        let (low, state) = plain_long_of(&mut coder, state, self.shift);
+        (self.whole(bin, low), state, coder)
+    }
+}
+
+/// Plain bits, as many as 32.
+fn plain_long(coder: &mut Encoder, lane: u8, value: u32, bits: u32) {
+    if bits > PLAIN_MAX {
+        coder.plain(lane, (value >> PLAIN_MAX) as u16, bits - PLAIN_MAX);
+    }
+    if bits > 0 {
+        coder.plain(lane, value as u16 & (((1u32 << bits.min(PLAIN_MAX)) - 1) as u16), bits.min(PLAIN_MAX));
+    }
+}
+
+fn plain_long_of(coder: &mut Decoder, mut state: u32, bits: u32) -> (u32, u32) {
+    let mut value = 0;
+    if bits > PLAIN_MAX {
+        (value, state) = coder.plain_of(state, bits - PLAIN_MAX);
+    }
+    let low = bits.min(PLAIN_MAX);
+    if low > 0 {
+        let (part, after) = coder.plain_of(state, low);
+        (value, state) = (value << low | part, after);
+    }
+    (value, state)
+}
+
+/// How often each magnitude was met in each class: what hazards are learnt from.
+#[derive(Debug, Clone)]
+pub struct Counts {
+    /// By class and group of magnitudes: how often a magnitude was in the group, and how often it was
+    /// at or beyond each of the group's magnitudes.
+    numbers: Vec<[(u64, u64); HAZARDS]>,
+    corrections: [[u64; 3]; CORRECTION_CLASSES],
+}
+
+impl Default for Counts {
+    fn default() -> Self {
+        Self { numbers: vec![[(0, 0); HAZARDS]; CLASSES], corrections: [[0; 3]; CORRECTION_CLASSES] }
+    }
+}
+
+impl Counts {
+    /// Notes a number or a correction.
+    pub fn add(&mut self, class: u8, value: i32) {
+        let class = usize::from(class);
+        if class >= CLASSES {
+            self.corrections[class - CLASSES][(value.clamp(-1, 1) + 1) as usize] += 1;
+            return;
+        }
+        let half = (1 << class_shift(class)) >> 1;
+        let magnitude = ((value + half) >> class_shift(class)).unsigned_abs() as usize;
+        for m in 0..=magnitude.min(DIRECT_MAX) {
+            let (stopped, reached) = &mut self.numbers[class][hazard_group(m)];
+            *reached += 1;
+            *stopped += u64::from(m == magnitude);
+        }
+    }
+
+    /// Adds up two counts.
+    pub fn merge(&mut self, other: &Self) {
+        for (a, b) in self.numbers.iter_mut().flatten().zip(other.numbers.iter().flatten()) {
+            *a = (a.0 + b.0, a.1 + b.1);
+        }
+        for (a, b) in self.corrections.iter_mut().flatten().zip(other.corrections.iter().flatten()) {
+            *a += b;
+        }
+    }
+
+    /// The model with these kernels whose hazards fit the counts, where there are enough of them.
+    #[must_use]
+    pub fn model(&self, levels: Vec<[Kernel; 2]>) -> Model {
+        // What a hazard is worth before anything is counted.
+        const PRIOR: u64 = 12;
+        let hazard = |stopped: u64, reached: u64, prior: u16| {
+            let h = (stopped * u64::from(TOTAL) + PRIOR * u64::from(prior)) / (reached + PRIOR);
+            h.clamp(1, u64::from(TOTAL) - 1) as u16
+        };
+        let start = Self::prior();
+        let numbers = std::array::from_fn(|c| {
+            std::array::from_fn(|g| {
+                let (stopped, reached) = self.numbers[c][g];
+                hazard(stopped, reached, start.0[c][g])
+            })
+        });
+        let corrections = std::array::from_fn(|c| {
+            let [farther, zero, nearer] = self.corrections[c];
+            let prior = start.1[c];
+            [hazard(zero, farther + zero + nearer, prior[0]), hazard(nearer, farther + nearer, prior[1])]
+        });
+        Model::new(levels, numbers, corrections)
+    }
+
+    fn prior() -> ([[u16; HAZARDS]; CLASSES], [[u16; 2]; CORRECTION_CLASSES]) {
+        let model = Model::default();
+        (model.numbers, model.corrections)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// Hazards as counts could give them, extremes included.
+    fn any_hazards() -> impl Strategy<Value = [u16; HAZARDS]> {
+        let any_hazard = prop_oneof![Just(1u16), Just(TOTAL as u16 - 1), 1..TOTAL as u16];
+        prop::array::uniform8(any_hazard)
+    }
+
+    proptest! {
+        #[test]
+        fn every_table_shares_out_everything(hazards in any_hazards(), shift in 0u32..12) {
+            let table = Table::of_numbers(&hazards, shift);
+            let shares: u32 = table.range.iter().map(|r| r & 0xffff).sum();
+            prop_assert_eq!(shares, TOTAL);
+            prop_assert!(table.range[ESCAPE] & 0xffff > 0, "any number can be sent");
+            for m in 0..=table.direct as usize {
+                prop_assert!(table.range[ZERO + m] & 0xffff > 0 && table.range[ZERO - m] & 0xffff > 0);
+            }
+        }
+
+        #[test]
+        fn any_number_comes_back_under_any_table(
+            hazards in any_hazards(),
+            items in prop::collection::vec((0..CLASSES as u8, prop_oneof![-3i32..=3, -4000i32..4000, -(1 << 26)..(1 << 26)]), 1..200),
+            lanes in 1usize..=2,
+        ) {
+            let tables = Tables::new(&[hazards; CLASSES], &[[2000, 2100]; CORRECTION_CLASSES]);
+            let mut coder = Encoder::default();
+            for (i, (class, value)) in items.iter().enumerate() {
+                tables.encode(&mut coder, (i % 2) as u8, *class, *value);
+            }
+            let bytes = coder.finish(lanes);
+            let (classes, values): (Vec<u8>, Vec<i32>) = items.into_iter().unzip();
+            let mut coder = Decoder::new(&bytes, lanes).unwrap();
+            let mut found = vec![0; values.len()];
+            tables.decode(&mut coder, &classes, &mut found);
+            prop_assert_eq!(found, values);
+            prop_assert!(coder.is_spent());
+        }
+
+        #[test]
+        fn every_activity_has_a_class_and_larger_ones_no_smaller(a in any::<f32>(), b in any::<f32>()) {
+            prop_assert!(usize::from(class(a)) < CLASSES);
+            prop_assert!(class(a) <= class(b) || a.is_nan() || b.is_nan() || a > b, "{} {}", a, b);
+        }
+    }
+
+    #[test]
+    fn an_octave_of_activity_has_two_classes() {
+        assert_eq!(class(1.0) - class(0.5), 2);
+        assert_eq!(class(1.5) - class(1.0), 1);
+        assert_eq!(class_from(usize::from(class(1.0))), 1 << 12);
+    }
+
+    #[test]
+    fn a_model_goes_through_its_description_and_damaged_ones_are_refused() {
+        let mut counts = Counts::default();
+        for i in 0..1000 {
+            counts.add(class(2.0), i % 7 - 3);
+        }
+        let model = counts.model(vec![[Kernel::default(); 2]; 5]);
+        assert_ne!(model, Model::default());
+        let text = serde_json::to_string(&model).unwrap();
+        assert_eq!(serde_json::from_str::<Model>(&text).unwrap(), model);
+        let zero = text.replacen(":[[4", ":[[0,4", 1);
+        assert!(serde_json::from_str::<Model>(&zero).is_err());
+        let none = serde_json::from_str::<Model>(r#"{"levels":[],"numbers":[],"corrections":[]}"#);
+        assert!(none.unwrap_err().to_string().contains("0 levels"));
+    }
+
+    #[test]
+    fn counts_of_a_class_make_what_is_frequent_cheap() {
+        let mut counts = Counts::default();
+        let usual = class(0.1);
+        for i in 0..10_000 {
+            counts.add(usual, i32::from(i % 100 == 0));
+        }
+        let tables = counts.model(vec![[Kernel::default(); 2]]);
+        let cost = |value| {
+            let mut coder = Encoder::default();
+            tables.tables().encode(&mut coder, 0, usual, value);
+            coder.bits()
+        };
+        assert!(
+            cost(0) < 0.02 && (7.0..9.0).contains(&cost(1)) && cost(-1) == cost(1),
+            "{} {}",
+            cost(0),
+            cost(1)
+        );
+    }
+}

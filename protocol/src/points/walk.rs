@@ -1,0 +1,534 @@
+//! The walk over a diamond's symbols, the same for sender and receiver.
+
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    reason = "a block has fewer than 2^16 points; numbers are below 2^31 and heights are checked"
+)]
+
+use super::coding::{Coding, Place, Rule, place};
+use super::model::{CAUSAL_BITS, Kernel, ROUGHNESSES, TILTS, class, correction_class};
+use super::rows::{Below, Ground, Row, activity, complete};
+use super::{DecodeError, Pass, Tally};
+use crate::bintree::Forest;
+use crate::diamond::{Block, Diamond, Local};
+use crate::rans::Context;
+use crate::{HEIGHT_MAX, NODATA};
+use std::ops::Range;
+
+/// The multiple of `step` nearest to `value`, in steps; `step` is odd, so nothing lies half way.
+pub(super) fn steps(value: i32, step: i32) -> i32 {
+    if step == 1 {
+        return value;
+    }
+    let magnitude = (value.unsigned_abs() + (step as u32 - 1) / 2) / step as u32;
+    if value < 0 { -(magnitude as i32) } else { magnitude as i32 }
+}
+
+/// `base + k * step`, if that is a height.
+fn moved(base: i32, k: i32, step: i32) -> Result<i32, DecodeError> {
+    let height = i64::from(base) + i64::from(k) * i64::from(step);
+    i32::try_from(height).ok().filter(|h| h.abs() <= HEIGHT_MAX).ok_or(DecodeError::Height)
+}
+
+/// In which of two ways the local grid lies on the lattice: upright or turned by a quarter.
+pub(super) fn way(local: &Local) -> usize {
+    let [x, y] = local.u;
+    // Of an even level u lies along x or y; of an odd one along one diagonal or the other.
+    usize::from(if x == 0 || y == 0 { x == 0 } else { (x > 0) != (y > 0) })
+}
+
+pub(super) fn walk<P: Pass>(
+    forest: &Forest,
+    coding: &Coding,
+    d: Diamond,
+    block: &mut Block,
+    mixed: bool,
+    pass: &mut P,
+) -> Result<Tally, DecodeError> {
+    let local = forest.local(d);
+    let old = walk_old(coding, d.level(), &local, block, mixed, pass)?;
+    let new = walk_new(coding, d.level(), &local, block, mixed, pass)?;
+    Ok(Tally { real: old.real + new.real, fictitious: old.fictitious + new.fictitious, ..old })
+}
+
+/// All that comes before the new points: the root's own points and the corrections.
+pub(super) fn walk_old<P: Pass>(
+    coding: &Coding,
+    level: u32,
+    local: &Local,
+    block: &mut Block,
+    mixed: bool,
+    pass: &mut P,
+) -> Result<Tally, DecodeError> {
+    let mut tally = Tally::default();
+    if level == 0 {
+        walk_root(coding, block, mixed, pass, &mut tally)?;
+    }
+    walk_corrections(coding, level, local.upper, block, pass, &mut tally)?;
+    Ok(tally)
+}
+
+/// The root square's own points, coarse to fine. Their heights are rounded to multiples of their step,
+/// not relative to a prediction, so that two squares which share a side give its points the same heights.
+fn walk_root<P: Pass>(
+    coding: &Coding,
+    block: &mut Block,
+    mixed: bool,
+    pass: &mut P,
+    tally: &mut Tally,
+) -> Result<(), DecodeError> {
+    let n = block.segments();
+    let row = n + 1;
+    let (old, _) = block.parts_mut();
+    old.fill(NODATA);
+    let mut validity = [Context::likely(7, 8), Context::likely(1, 2), Context::likely(1, 8)];
+    let tables = coding.model().tables();
+    let mut point = |old: &mut [i32], u: usize, v: usize, near: &[usize]| -> Result<(), DecodeError> {
+        let slot = v * row + u;
+        let known = near.iter().map(|s| old[*s]).filter(|h| *h != NODATA);
+        let (low, high, sum, count) = known.fold((i32::MAX, i32::MIN, 0i64, 0i64), |(l, h, s, c), height| {
+            (l.min(height), h.max(height), s + i64::from(height), c + 1)
+        });
+        if mixed {
+            let context = match count {
+                0 => 2,
+                c if c == near.len() as i64 => 0,
+                _ => 1,
+            };
+            if !pass.valid(&mut validity[context], slot) {
+                return Ok(());
+            }
+        }
+        let corner = (u == 0 || u == n) && (v == 0 || v == n);
+        // Corners lie strictly inside no diamond at all: nobody will correct them.
+        let step = coding.step(if corner { 0 } else { coding.first_exponent() });
+        let mean = if count > 0 { sum.div_euclid(count) as i32 } else { 0 };
+        let expected = steps(mean, step);
+        // Some third of what the neighbours differ; of a lone or a first point nothing is known.
+        let activity = if count < 2 { 200.0 } else { 0.3 * (high - low) as f32 / step as f32 + 0.25 };
+        let classes = [class(activity)];
+        let mut number = [0];
+        pass.receive(tables, &classes, &mut number);
+        let k = pass.number(number[0], slot, |h| steps(h, step) - expected);
+        pass.send(tables, &classes, &[k]);
+        old[slot] = moved(0, expected.checked_add(k).ok_or(DecodeError::Height)?, step)?;
+        *(if k == 0 { &mut tally.fictitious } else { &mut tally.real }) += 1;
+        Ok(())
+    };
+    for (u, v) in [(0, 0), (n, 0), (n, n), (0, n)] {
+        let before = [0, n, n * row + n];
+        let count = [(0, 0), (n, 0), (n, n), (0, n)].iter().position(|c| *c == (u, v)).unwrap_or(0);
+        point(old, u, v, &before[..count])?;
+    }
+    let mut side = n;
+    while side > 1 {
+        let half = side / 2;
+        for v in (half..n).step_by(side) {
+            for u in (half..n).step_by(side) {
+                let at = |du: usize, dv: usize| (v + dv - half) * row + u + du - half;
+                point(old, u, v, &[at(0, 0), at(side, 0), at(side, side), at(0, side)])?;
+            }
+        }
+        for v in (0..=n).step_by(half) {
+            let first = if v % side == 0 { half } else { 0 };
+            for u in (first..=n).step_by(side) {
+                let at = |ok: bool, u: usize, v: usize| if ok { v * row + u } else { usize::MAX };
+                let near = [
+                    at(u >= half, u.wrapping_sub(half), v),
+                    at(u + half <= n, u + half, v),
+                    at(v >= half, u, v.wrapping_sub(half)),
+                    at(v + half <= n, u, v + half),
+                ];
+                let mut inside = [0; 4];
+                let mut count = 0;
+                for slot in near.into_iter().filter(|slot| *slot != usize::MAX) {
+                    inside[count] = slot;
+                    count += 1;
+                }
+                point(old, u, v, &inside[..count])?;
+            }
+        }
+        side = half;
+    }
+    Ok(())
+}
+
+/// By how many factors of three the split makes the old points of a place more precise.
+fn depth(coding: &Coding, level: u32, place: Place) -> u8 {
+    coding.exponent_before(level, place).saturating_sub(coding.exponent(level, place))
+}
+
+const PLACES: [Place; 4] = [Place::Off, Place::Hypotenuse, Place::OtherDiagonal, Place::Centre];
+
+/// Whether the split says something of an old point.
+pub(super) fn has_corrections(coding: &Coding, level: u32, upper: bool, block: &Block) -> bool {
+    if PLACES.iter().all(|p| depth(coding, level, *p) == 0) {
+        return false;
+    }
+    let n = block.segments();
+    let (old, _) = block.parts();
+    (1..n).any(|v| {
+        (if upper { 1 } else { v }..n)
+            .any(|u| old[v * (n + 1) + u] != NODATA && depth(coding, level, place(n, 2 * u, 2 * v)) > 0)
+    })
+}
+
+/// Corrections of the old points strictly inside: in each round, coarse to fine, every point whose step is
+/// still too large moves to one of three.
+fn walk_corrections<P: Pass>(
+    coding: &Coding,
+    level: u32,
+    upper: bool,
+    block: &mut Block,
+    pass: &mut P,
+    tally: &mut Tally,
+) -> Result<(), DecodeError> {
+    let n = block.segments();
+    let depths = PLACES.map(|p| depth(coding, level, p));
+    let finest = PLACES.map(|p| coding.exponent(level, p));
+    let rounds = depths.into_iter().max().unwrap_or(0);
+    let (old, _) = block.parts_mut();
+    let holes = rounds > 0 && old.contains(&NODATA);
+    let mut thirds = Thirds::new(n);
+    for round in (1..=rounds).rev() {
+        for v in 1..n {
+            thirds.clear();
+            // Between the diagonals all points are alike; those on them may be of another precision.
+            let (low, high) = (v.min(n - v), v.max(n - v));
+            let first = if upper { 1 } else { v };
+            let between = |thirds: &mut Thirds, from: usize, to: usize| {
+                let (from, to) = (from.max(first), to.min(n));
+                if depths[0] < round || from >= to {
+                    return;
+                }
+                let step = coding.step(finest[0] + round - 1);
+                let slots = v * (n + 1) + from..v * (n + 1) + to;
+                if holes || (!upper && from == v) {
+                    for slot in slots.filter(|s| old[*s] != NODATA) {
+                        thirds.push(old, n, slot, upper || slot % (n + 1) > v, step);
+                    }
+                } else {
+                    thirds.push_all(old, n, slots, step);
+                }
+            };
+            between(&mut thirds, 0, low);
+            for (i, u) in [low, high].into_iter().enumerate().take(if low == high { 1 } else { 2 }) {
+                let at = PLACES.iter().position(|p| *p == place(n, 2 * u, 2 * v)).unwrap_or(0);
+                let slot = v * (n + 1) + u;
+                if (first..n).contains(&u) && depths[at] >= round && old[slot] != NODATA {
+                    thirds.push(old, n, slot, upper || u > v, coding.step(finest[at] + round - 1));
+                }
+                between(&mut thirds, u + 1, if i == 0 && low < high { high } else { n });
+            }
+            thirds.pass(coding, pass, old, tally)?;
+        }
+    }
+    Ok(())
+}
+
+/// A row's worth of corrections by a third, in the order of the row.
+struct Thirds {
+    slots: Vec<usize>,
+    steps: Vec<i32>,
+    /// Whether the neighbours lie lower: towards them counts as up.
+    down: Vec<bool>,
+    classes: Vec<u8>,
+    numbers: Vec<i32>,
+}
+
+/// The class of a correction by `1 / per_step` of a point with these neighbours to the west, east, south
+/// and north; and whether they lie lower.
+#[inline(always)]
+fn third(here: i32, [w, e, s, n]: [i32; 4], per_step: f32) -> (u8, bool) {
+    // How far the neighbours' mean lies to one side, in parts of the three steps to choose from.
+    const TILT: [f32; TILTS - 1] = [0.06, 0.18, 0.35, 0.6, 1.2];
+    const ROUGH: [f32; ROUGHNESSES - 1] = [6.0, 18.0];
+    let tilt = w + e + s + n - 4 * here;
+    let aside = tilt.abs() as f32 * (per_step * (1.0 / 12.0));
+    let bends = (2 * (w + e - s - n).abs() + (w - e).abs() + (s - n).abs()) as f32 * (per_step * 0.25);
+    let tilted: u8 = TILT.iter().map(|limit| u8::from(aside >= *limit)).sum();
+    let rough: u8 = ROUGH.iter().map(|limit| u8::from(bends >= *limit)).sum();
+    (correction_class(tilted, rough), tilt < 0)
+}
+
+impl Thirds {
+    fn new(n: usize) -> Self {
+        let room = n + 1;
+        Self {
+            slots: Vec::with_capacity(room),
+            steps: Vec::with_capacity(room),
+            down: Vec::with_capacity(room),
+            classes: Vec::with_capacity(room),
+            numbers: Vec::with_capacity(room),
+        }
+    }
+
+    fn clear(&mut self) {
+        self.slots.clear();
+        self.steps.clear();
+        self.down.clear();
+        self.classes.clear();
+    }
+
+    /// Adds the old point at `slot`, to be moved by a `step` or not at all. `beside`: whether there are
+    /// points to the west and to the north of it.
+    fn push(&mut self, old: &[i32], n: usize, slot: usize, beside: bool, step: i32) {
+        let here = old[slot];
+        let known = |exists: bool, slot: usize| match old.get(slot) {
+            Some(h) if exists && *h != NODATA => *h,
+            _ => here,
+        };
+        let near = [
+            known(beside, slot - 1),
+            known(true, slot + 1),
+            known(true, slot - n - 1),
+            known(beside, slot + n + 1),
+        ];
+        let (class, down) = third(here, near, 1.0 / step as f32);
+        self.slots.push(slot);
+        self.steps.push(step);
+        self.classes.push(class);
+        self.down.push(down);
+    }
+
+    /// Adds a run of old points whose neighbours all have heights.
+    fn push_all(&mut self, old: &[i32], n: usize, slots: Range<usize>, step: i32) {
+        let (from, count) = (slots.start, slots.len());
+        let per_step = 1.0 / step as f32;
+        let line = |at: usize| &old[at..at + count];
+        let (here, w, e) = (line(from), line(from - 1), line(from + 1));
+        let (s, north) = (line(from - n - 1), line(from + n + 1));
+        let start = self.classes.len();
+        self.slots.extend(slots);
+        self.steps.resize(start + count, step);
+        self.classes.resize(start + count, 0);
+        self.down.resize(start + count, false);
+        let (classes, down) = (&mut self.classes[start..][..count], &mut self.down[start..][..count]);
+        for u in 0..count {
+            (classes[u], down[u]) = third(here[u], [w[u], e[u], s[u], north[u]], per_step);
+        }
+    }
+
+    fn pass<P: Pass>(
+        &mut self,
+        coding: &Coding,
+        pass: &mut P,
+        old: &mut [i32],
+        tally: &mut Tally,
+    ) -> Result<(), DecodeError> {
+        let tables = coding.model().tables();
+        self.numbers.clear();
+        self.numbers.resize(self.slots.len(), 0);
+        pass.receive(tables, &self.classes, &mut self.numbers);
+        let places = self.slots.iter().zip(&self.steps).zip(&self.down);
+        for (((slot, step), down), number) in places.zip(&mut self.numbers) {
+            let base = old[*slot];
+            let turn = |k: i32| if *down { -k } else { k };
+            *number = pass.number(*number, *slot, |h| turn(steps(h - base, *step).clamp(-1, 1)));
+            // Where numbers are damaged they are still small: tables of corrections have three symbols.
+            old[*slot] = moved(base, turn(*number), *step)?;
+            tally.corrected += u32::from(*number != 0);
+        }
+        pass.send(tables, &self.classes, &self.numbers);
+        Ok(())
+    }
+}
+
+/// Which new points have a height: into `new`, 0 for those that have.
+fn walk_validity<P: Pass>(old: &[i32], new: &mut [i32], n: usize, upper: bool, pass: &mut P) {
+    let mut contexts: [Context; 20] = std::array::from_fn(|i| {
+        Context::likely(1 + 2 * (i as u64 / 4) + 3 * (i as u64 % 4).count_ones() as u64, 16)
+    });
+    let border = (n + 1) * (n + 1);
+    for v in 0..n {
+        let first = if upper { 0 } else { v };
+        for u in first..n {
+            let at = v * (n + 1) + u;
+            let corners = [at, at + 1, at + n + 2, at + n + 1];
+            // The diagonal's last corner lies beyond a diamond at the border.
+            let corners = &corners[..if !upper && u == v { 3 } else { 4 }];
+            let valid = corners.iter().filter(|s| old[**s] != NODATA).count();
+            let west = u > first && new[v * n + u - 1] != NODATA;
+            let south = v > 0 && new[(v - 1) * n + u] != NODATA;
+            let context = valid * 4 + usize::from(west) * 2 + usize::from(south);
+            let has = pass.valid(&mut contexts[context], border + v * n + u);
+            new[v * n + u] = if has { 0 } else { NODATA };
+        }
+    }
+}
+
+/// The new points, row by row.
+pub(super) fn walk_new<P: Pass>(
+    coding: &Coding,
+    level: u32,
+    local: &Local,
+    block: &mut Block,
+    mixed: bool,
+    pass: &mut P,
+) -> Result<Tally, DecodeError> {
+    let mut tally = Tally::default();
+    let n = block.segments();
+    let (old, new) = block.parts_mut();
+    new.fill(NODATA);
+    if mixed {
+        walk_validity(old, new, n, local.upper, pass);
+    }
+    let quiet = pass.new_points();
+    let mut rows = NewRows::new(coding, level, local, old, n);
+    let mut all_zero = true;
+    for v in 0..n {
+        let first = if local.upper { 0 } else { v };
+        rows.predict(old, v);
+        let line = &mut new[v * n..(v + 1) * n];
+        rows.choose(line, first, mixed);
+        if !quiet {
+            rows.receive(coding, pass);
+        }
+        rows.rebuild(line, v, pass)?;
+        all_zero &= rows.numbers.iter().all(|k| *k == 0);
+        rows.tally(&mut tally);
+        rows.send(coding, pass);
+    }
+    pass.was_quiet(all_zero);
+    Ok(tally)
+}
+
+/// The state of the walk over rows of new points.
+struct NewRows<'a> {
+    n: usize,
+    coding: &'a Coding,
+    kernel: Kernel,
+    ground: Ground,
+    row: Row,
+    below: Below,
+    /// Steps of new points off the diagonals and on them.
+    steps: [i32; 2],
+    /// Of every place of the row: the prediction, the part of it that comes from old points (both less the
+    /// base), and the class.
+    guesses: Vec<i32>,
+    bases: Vec<i32>,
+    classes: Vec<u8>,
+    /// Places of the row with a height, with their classes and numbers.
+    places: Vec<usize>,
+    chosen: Vec<u8>,
+    numbers: Vec<i32>,
+}
+
+impl<'a> NewRows<'a> {
+    fn new(coding: &'a Coding, level: u32, local: &Local, old: &[i32], n: usize) -> Self {
+        let mut kernel = *coding.model().kernel(level, way(local));
+        if coding.rule() == Rule::Midpoint {
+            kernel.causal = [0; 4];
+        }
+        Self {
+            n,
+            coding,
+            kernel,
+            ground: Ground::new(old, n, local.upper),
+            row: Row::new(n),
+            below: Below::new(n),
+            steps: [Place::Off, Place::Hypotenuse].map(|p| coding.step(coding.exponent(level, p))),
+            guesses: vec![0; n],
+            bases: vec![0; n],
+            classes: vec![0; n],
+            places: Vec::with_capacity(n),
+            chosen: Vec::with_capacity(n),
+            numbers: Vec::with_capacity(n),
+        }
+    }
+
+    /// Predictions and classes of all places of row v.
+    fn predict(&mut self, old: &[i32], v: usize) {
+        let n = self.n;
+        self.ground.row(v, &self.kernel, &mut self.row);
+        if v == 0 {
+            self.below.expect(&self.row, &self.kernel, self.steps[0]);
+        }
+        let (guesses, bases, classes) = (&mut self.guesses, &mut self.bases, &mut self.classes);
+        complete(&self.row, &self.below, &self.kernel, self.steps[0], guesses, bases, classes);
+        if self.steps[0] != self.steps[1] {
+            for u in [v, n - 1 - v] {
+                classes[u] = class(activity(&self.row, &self.below, &self.kernel, self.steps[1], u));
+            }
+        }
+        if self.coding.rule() == Rule::Midpoint {
+            for (u, guess) in guesses.iter_mut().enumerate() {
+                let at = v * (n + 1) + u;
+                let (a, b) = if (u + v).is_multiple_of(2) { (at, at + n + 2) } else { (at + 1, at + n + 1) };
+                if old[a] != NODATA && old[b] != NODATA {
+                    *guess = ((old[a] + old[b] + 1) >> 1) - self.ground.base;
+                }
+            }
+        }
+    }
+
+    /// Which places of the row have a height, from `first` on.
+    fn choose(&mut self, line: &[i32], first: usize, mixed: bool) {
+        self.places.clear();
+        self.chosen.clear();
+        if mixed {
+            self.places.extend((first..self.n).filter(|u| line[*u] != NODATA));
+            self.chosen.extend(self.places.iter().map(|u| self.classes[*u]));
+        } else {
+            self.places.extend(first..self.n);
+            self.chosen.extend_from_slice(&self.classes[first..]);
+        }
+        self.numbers.clear();
+        self.numbers.resize(self.places.len(), 0);
+    }
+
+    fn receive<P: Pass>(&mut self, coding: &Coding, pass: &mut P) {
+        pass.receive(coding.model().tables(), &self.chosen, &mut self.numbers);
+    }
+
+    fn send<P: Pass>(&mut self, coding: &Coding, pass: &mut P) {
+        pass.send(coding.model().tables(), &self.chosen, &self.numbers);
+    }
+
+    /// Heights of the row from its numbers; and what the next row will want to know.
+    fn rebuild<P: Pass>(&mut self, line: &mut [i32], v: usize, pass: &mut P) -> Result<(), DecodeError> {
+        let n = self.n;
+        let slot = (n + 1) * (n + 1) + v * n;
+        let west_weight = i64::from(self.kernel.causal[3]);
+        let base = self.ground.base;
+        let mut before = usize::MAX;
+        let mut missing = 0i64;
+        let mut beyond = 0;
+        if self.places.len() < n {
+            self.below.clear();
+        }
+        for (u, number) in self.places.iter().copied().zip(&mut self.numbers) {
+            // West of a hole nothing is known.
+            if before.wrapping_add(1) != u {
+                missing = 0;
+            }
+            before = u;
+            let causal = (west_weight * missing + (1 << (CAUSAL_BITS - 1))) >> CAUSAL_BITS;
+            let deduced = i64::from(base) + i64::from(self.guesses[u]) + causal;
+            let step = self.steps[usize::from(u == v || u + v == n - 1)];
+            *number = pass.number(*number, slot + u, |h| steps((i64::from(h) - deduced) as i32, step));
+            let height = deduced + i64::from(*number) * i64::from(step);
+            beyond |= height.unsigned_abs() >> HEIGHT_BITS;
+            line[u] = height as i32;
+            missing = height - i64::from(base) - i64::from(self.bases[u]);
+            self.below.missing[u + 1] = missing as f32;
+            self.below.numbers[u + 1] = number.unsigned_abs().min(NUMBER_MAX) as f32;
+        }
+        self.below.close();
+        if beyond == 0 { Ok(()) } else { Err(DecodeError::Height) }
+    }
+
+    fn tally(&self, tally: &mut Tally) {
+        let fictitious = self.numbers.iter().filter(|k| **k == 0).count() as u32;
+        tally.fictitious += fictitious;
+        tally.real += self.numbers.len() as u32 - fictitious;
+    }
+}
+
+/// Heights are below 2^HEIGHT_BITS in magnitude.
+const HEIGHT_BITS: u32 = (HEIGHT_MAX as u32 + 1).trailing_zeros();
+
+/// Larger numbers make a neighbour no rougher.
+const NUMBER_MAX: u32 = 1000;
