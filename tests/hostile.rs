@@ -351,7 +351,7 @@ fn what_is_no_store_is_refused() {
             ("bare", ["bare", "not a store", "diamantina-server build"]),
             ("nowhere", ["nowhere", "not a store", "diamantina-server build"]),
             ("dem.tif", ["dem.tif", "not a store", "diamantina-server build"]),
-            ("newer", ["newer", "format 2", "build it again"]),
+            ("newer", ["newer", "format 3", "build it again"]),
             ("text", ["text", "not JSON", "build the store again"]),
             ("alone", ["alone", "directory", "cannot read"]),
         ] {
