@@ -40,14 +40,16 @@ const READ_MAX: usize = 1 << 24;
 const BUILT_MAX: usize = 1 << 22;
 /// What a whole build takes for each sample, compared with a tile's: diamonds that straddle chunks are coded
 /// on both sides, there are more levels to compare, and blobs are laid into packs. Measured.
-const WHOLE_TO_TILE: f64 = 1.4;
-/// What a build takes however small the source: mostly waiting for the disk to sync. Measured.
-const FIXED_SECONDS: f64 = 0.1;
-/// The levels of one step of the quadtree cost a quarter of those of the next finer one on ground that is flat
-/// or noise, and at most this share where relief grows with distance.
-const COARSER_MAX: f64 = 0.8;
+const WHOLE_TO_TILE: f64 = 1.6;
+/// What a build takes however small the source: the coding is chosen, the disk synced. Measured.
+const FIXED_SECONDS: f64 = 0.22;
+/// Where points of the coarser levels stop costing more and more: their steps grow with what there is to say.
+/// Bytes; measured.
+const POINT_BYTES_MAX: f64 = 3.5 / 8.0;
 /// What a payload takes whatever it holds: its header and the end of its symbols.
 const FIXED_BYTES: f64 = points::HEADER_BYTES as f64 + 4.0;
+/// Steps of the quadtree above a tile that cost anything.
+const STEPS_MAX: i32 = 10;
 /// What the journal takes for a diamond.
 const JOURNAL_BYTES: u64 = 60;
 
@@ -119,7 +121,7 @@ pub fn estimate(source: &Source, options: &Options) -> Result<Estimate, BuildErr
     for (level, sum) in levels.iter_mut().enumerate() {
         *sum = each.iter().map(|(levels, _)| levels[level]).sum();
     }
-    let bytes = of_all_levels(levels);
+    let bytes = of_all_levels(levels, built_valid);
     let workers = rayon::current_num_threads().min(plan.workers);
     let building = each.iter().map(|(_, took)| *took).sum::<Duration>() / workers as u32;
     let per = |part: f64, of: u64| if of == 0 { 0.0 } else { part / of as f64 };
@@ -214,11 +216,19 @@ fn diamonds(forest: &Forest, grid: &Grid, tiles: &[Tile], tile_side: u32) -> u64
 /// nowhere else.
 type Levels = [f64; 2 * TILE_LOG2 as usize];
 
-/// The bytes of all levels of a source, from those of its tiles.
-fn of_all_levels([_, one, two, three]: Levels) -> f64 {
-    // Two levels are one step of the quadtree; odd levels compare with odd ones.
-    let share = if three > 0.0 { (one / three).clamp(0.25, COARSER_MAX) } else { 0.25 };
-    three + (one + two) / (1.0 - share)
+/// The bytes of all levels of a source, from those of its tiles with so many samples that have a height.
+fn of_all_levels([_, one, two, three]: Levels, samples: u64) -> f64 {
+    let samples = samples as f64;
+    // Two levels are one step of the quadtree. A point of the next coarser ones costs more by as much as it
+    // does from the third level to the first, but not for ever.
+    let points = samples * 3.0 / 8.0;
+    let growth = if three > 0.0 { (4.0 * one / three).clamp(1.0, 4.0) } else { 1.0 };
+    let own = if points > 0.0 { (one + two) / points } else { 0.0 };
+    let coarser = (1..=STEPS_MAX).map(|step| {
+        let each = (own * growth.powi(step)).min(POINT_BYTES_MAX.max(own));
+        each * points / 4f64.powi(step)
+    });
+    three + two + one + coarser.sum::<f64>()
 }
 
 /// Builds a tile in a temporary folder; the bytes of its payloads, and how long coding and comparing took.
@@ -275,11 +285,13 @@ mod tests {
 
     #[test]
     fn coarser_levels_follow_from_finer_ones() {
-        // Noise: each level costs half of the next; the root's own points do not count.
-        assert!((of_all_levels([1e9, 1.0, 2.0, 4.0]) - 8.0).abs() < 1e-9);
-        assert!(of_all_levels([0.0; 4]) == 0.0);
-        // Whatever the tiles say, it stays finite.
-        assert!(of_all_levels([0.0, 9.0, 1.0, 1.0]) < 51.1);
+        // As much for each point at every level; the root's own points do not count.
+        let found = of_all_levels([1e9, 1.0, 2.0, 4.0], 8);
+        assert!((found - 8.0).abs() < 1e-3, "{found}");
+        assert!(of_all_levels([0.0; 4], 8) == 0.0 && of_all_levels([0.0; 4], 0) == 0.0);
+        // However fast the cost grows, a third of the points cost no more than the most that a point does.
+        let found = of_all_levels([0.0, 0.01, 0.001, 0.001], 800);
+        assert!(found < 0.012 + 100.0 * POINT_BYTES_MAX, "{found}");
     }
 
     #[test]

@@ -165,9 +165,7 @@ impl Job<'_> {
             } else {
                 self.odd_row(row, y, out);
             }
-            for value in &out[first..] {
-                range = range.larger(value.magnitude());
-            }
+            range = range.larger(largest(&out[first..]));
         }
         range.into()
     }
@@ -182,21 +180,26 @@ impl Job<'_> {
             out.extend((0..count as u32).map(|i| T::of_exact(self.point(self.tile.x + i * spacing, y))));
             return;
         }
-        // The tile begins with a whole cell.
+        // The tile begins and ends with a whole cell: pairs of points, and one more.
+        let first = out.len();
+        out.resize(first + count, T::ZERO);
+        let (pairs, last) = out[first..].as_chunks_mut::<2>();
+        let (here, end) = row.as_chunks::<2>();
         if odd_row == 0 {
-            out.push(self.relative(row[0]));
-            out.extend(row.windows(3).enumerate().map(|(i, near)| {
-                let mean = (self.relative::<T>(near[0]) + self.relative(near[2])) * T::HALF;
-                if i % 2 == 0 { mean } else { self.relative(near[1]) }
-            }));
-            out.push(self.relative(row[count - 1]));
+            let next = row[1..].as_chunks::<2>().0;
+            for ((pair, [west, _]), [_, east]) in pairs.iter_mut().zip(here).zip(next) {
+                let (west, east) = (self.relative::<T>(*west), self.relative::<T>(*east));
+                *pair = [west, (west + east) * T::HALF];
+            }
+            last[0] = self.relative(end[0]);
         } else {
-            let below = self.nodes.row(self.tile.x, y - spacing, count);
-            let above = self.nodes.row(self.tile.x, y + spacing, count);
-            out.extend(row.iter().zip(below).zip(above).enumerate().map(|(i, ((here, below), above))| {
-                let mean = (self.relative::<T>(*below) + self.relative(*above)) * T::HALF;
-                if i % 2 == 0 { mean } else { self.relative(*here) }
-            }));
+            let (south, south_end) = self.nodes.row(self.tile.x, y - spacing, count).as_chunks::<2>();
+            let (north, north_end) = self.nodes.row(self.tile.x, y + spacing, count).as_chunks::<2>();
+            let mean = |a: i32, b: i32| (self.relative::<T>(a) + self.relative(b)) * T::HALF;
+            for (((pair, [_, middle]), [a, _]), [b, _]) in pairs.iter_mut().zip(here).zip(south).zip(north) {
+                *pair = [mean(*a, *b), self.relative(*middle)];
+            }
+            last[0] = mean(south_end[0], north_end[0]);
         }
     }
 
@@ -306,6 +309,18 @@ impl Job<'_> {
         let rest = drawn_rest.iter().zip(samples_rest).map(|(drawn, sample)| distance(*drawn, *sample));
         worst.into_iter().chain(rest).fold(T::ZERO, T::larger)
     }
+}
+
+/// The largest magnitude.
+fn largest<T: Real>(values: &[T]) -> T {
+    let mut largest = [T::ZERO; LANES];
+    let (values, rest) = values.as_chunks::<LANES>();
+    for values in values {
+        for lane in 0..LANES {
+            largest[lane] = largest[lane].larger(values[lane].magnitude());
+        }
+    }
+    largest.into_iter().chain(rest.iter().map(|value| value.magnitude())).fold(T::ZERO, T::larger)
 }
 
 /// Halves a lattice of `cells` squares a side: `from` has `cells + 1` points in a row, `to` gets twice as many
