@@ -89,7 +89,7 @@ impl Cache {
         if self.held.contains_key(&key) || !self.has_parents(&forest, key) {
             return false;
         }
-        let bytes = Surface::bytes(forest.segments());
+        let bytes = Surface::bytes(&forest, d.level());
         let room = if wanted {
             // Unless it has a share in the cut, a parent could be evicted to make room for its child.
             self.touch_ancestors(&forest, key);
@@ -144,7 +144,7 @@ impl Cache {
             self.held.remove(&key);
             let (layer, d) = key;
             let forest = self.forests[layer];
-            self.bytes -= Surface::bytes(forest.segments());
+            self.bytes -= Surface::bytes(&forest, d.level());
             for parent in forest.parents(d) {
                 let Some(held) = self.held.get_mut(&(layer, parent)) else { continue };
                 held.children -= 1;
@@ -240,7 +240,7 @@ mod tests {
         let built = &world()[0];
         let forest = built.layer.forest;
         let all = surfaces(built, |_| true);
-        let size = Surface::bytes(forest.segments());
+        let size = Surface::bytes(&forest, 0);
         let mut cache = Cache::new(vec![forest], 300 * size + size / 2);
         let mut dice = Dice(11);
         let mut evicted = 0;
@@ -251,7 +251,7 @@ mod tests {
                 camera: &camera,
                 exaggeration: 1.0,
                 tolerance_pixels: 0.5,
-                splits_max: 225,
+                memory_bytes: 225 * size,
             };
             let ideal = choose(&ask, |d| Some(built.entries[&d]));
             cache.want(ideal.splits().map(|d| (0, d)));
@@ -266,7 +266,8 @@ mod tests {
                     inserted += usize::from(cache.insert((0, d), Arc::clone(&all[&d]), true));
                 }
                 assert!(cache.bytes() <= cache.budget_bytes);
-                assert_eq!(cache.bytes(), cache.len() * size);
+                let sum: usize = cache.held.keys().map(|(_, d)| Surface::bytes(&forest, d.level())).sum();
+                assert_eq!(cache.bytes(), sum);
             }
             evicted += before + inserted - cache.len();
             for (_, d) in cache.held.keys() {

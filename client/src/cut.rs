@@ -39,8 +39,8 @@ pub struct Ask<'a> {
     pub exaggeration: f64,
     /// The error to reach, in pixels.
     pub tolerance_pixels: f64,
-    /// Diamonds that may be split; the roots are, in any case.
-    pub splits_max: usize,
+    /// Bytes that the surfaces of split diamonds may take; the roots are split in any case.
+    pub memory_bytes: usize,
 }
 
 impl Ask<'_> {
@@ -180,6 +180,7 @@ pub fn choose(ask: &Ask, entry: impl Fn(Diamond) -> Option<Entry>) -> Ideal {
         ideal: Ideal::default(),
         heap: BinaryHeap::new(),
         wanted: HashSet::default(),
+        spent_bytes: 0,
     };
     let roots: Vec<u32> = chooser.forest.root_diamonds().map(|root| chooser.see(root, None)).collect();
     for root in roots {
@@ -327,6 +328,8 @@ struct Chooser<'a, F> {
     ideal: Ideal,
     heap: BinaryHeap<Candidate>,
     wanted: HashSet<u32, RandomState>,
+    /// What the surfaces of the split diamonds take.
+    spent_bytes: usize,
 }
 
 impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
@@ -373,6 +376,7 @@ impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
     /// Splits a node whose parents are split.
     fn split(&mut self, number: u32) {
         let Node { diamond, entry, in_view, .. } = *self.ideal.node(number);
+        self.spent_bytes += Surface::bytes(&self.forest, diamond.level());
         let mut children = [NONE; 4];
         for (slot, child) in children.iter_mut().zip(self.forest.children(diamond)) {
             if let Some(child) = child {
@@ -397,7 +401,7 @@ impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
     /// Splits a node and whichever ancestors are not split yet; or none of them, where the index does not
     /// know them all or the memory is spent.
     fn force(&mut self, number: u32) {
-        if self.ideal.splits.len() >= self.ask.splits_max {
+        if self.spent_bytes >= self.ask.memory_bytes {
             return;
         }
         let mut chain = vec![number];
@@ -420,7 +424,9 @@ impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
                 }
             }
         }
-        if blocked || self.ideal.splits.len() + chain.len() > self.ask.splits_max {
+        let level = |i: &u32| self.ideal.node(*i).diamond.level();
+        let bytes: usize = chain.iter().map(|i| Surface::bytes(&self.forest, level(i))).sum();
+        if blocked || self.spent_bytes + bytes > self.ask.memory_bytes {
             return;
         }
         chain.sort_by_key(|i| self.ideal.node(*i).diamond.level());
@@ -469,25 +475,27 @@ mod tests {
     type Side = Vec<([i64; 2], i32)>;
 
     fn ask<'a>(built: &'a Built, camera: &'a Camera, tolerance_pixels: f64) -> Ask<'a> {
-        Ask { layer: &built.layer, camera, exaggeration: 1.0, tolerance_pixels, splits_max: usize::MAX }
+        Ask { layer: &built.layer, camera, exaggeration: 1.0, tolerance_pixels, memory_bytes: usize::MAX }
     }
 
-    /// The three sides of a drawn triangle: n+1 lattice points with their heights, from the lesser end.
+    /// The three sides of a drawn triangle: lattice points with their heights, from the lesser end.
     fn sides_of(built: &Built, item: &DrawItem, side: usize) -> [Side; 3] {
         let local = built.layer.forest.local(item.diamond);
-        let n = built.layer.forest.segments();
+        let (n, centres) = (item.surface.block().segments(), item.surface.block().has_centres());
         let m = 2 * n as i64;
         let corners = [[0, 0], [m, 0], [m, m], [0, m]];
         let (a, b, centre) = (corners[side], corners[(side + 1) % 4], [m / 2, m / 2]);
-        [(a, b), (b, centre), (centre, a)].map(|(from, to)| {
-            let mut points: Side = (0..=n as i64)
+        // Where centres are no points, half of a diagonal has half as many segments.
+        let inner = if centres { n } else { n / 2 };
+        [(a, b, n), (b, centre, inner), (centre, a, inner)].map(|(from, to, count)| {
+            let mut points: Side = (0..=count as i64)
                 .map(|i| {
-                    let p = [0, 1].map(|k| from[k] + (to[k] - from[k]) * i / n as i64);
+                    let p = [0, 1].map(|k| from[k] + (to[k] - from[k]) * i / count as i64);
                     let slot = Block::slot(n, p[0] as usize, p[1] as usize);
                     (local.lattice2(p), item.surface.block().heights()[slot])
                 })
                 .collect();
-            if points[0].0 > points[n].0 {
+            if points[0].0 > points[count].0 {
                 points.reverse();
             }
             points
@@ -526,7 +534,7 @@ mod tests {
         }
         for d in drawn.iter().copied() {
             let [u, v] = [forest.local(d).u, forest.local(d).v];
-            let n = forest.segments() as i64;
+            let n = forest.segments_at(d.level()) as i64;
             let quarter = (u[0] * v[1] - u[1] * v[0]).abs() * n * n / 2;
             let empty = |c: &Diamond| built.entries[c].is_empty();
             void += quarter * forest.children(d).iter().flatten().filter(|c| empty(c)).count() as i64;
@@ -676,10 +684,14 @@ mod tests {
         let built = &world()[0];
         let camera = above();
         let mut last = f64::INFINITY;
-        for splits_max in [2, 50, 200, 800] {
-            let ask = Ask { splits_max, ..ask(built, &camera, 0.1) };
+        let forest = &built.layer.forest;
+        let largest = Surface::bytes(forest, 0);
+        for surfaces in [2, 50, 200, 800] {
+            let memory_bytes = surfaces * largest;
+            let ask = Ask { memory_bytes, ..ask(built, &camera, 0.1) };
             let ideal = choose(&ask, |d| Some(built.entries[&d]));
-            assert!(ideal.len() <= splits_max && ideal.len() * 10 >= splits_max * 9, "{}", ideal.len());
+            let bytes: usize = ideal.splits().map(|d| Surface::bytes(forest, d.level())).sum();
+            assert!(bytes <= memory_bytes && bytes * 10 >= memory_bytes * 9, "{bytes} of {memory_bytes}");
             let goal = draw(0, &ask, &ideal, |_| None).error_pixels_goal;
             assert!(goal < last);
             last = goal;
@@ -705,7 +717,8 @@ mod tests {
     fn a_cut_of_a_thousand_diamonds_takes_less_than_a_frame() {
         let built = &world()[0];
         let camera = above();
-        let ask = Ask { splits_max: 1000, ..ask(built, &camera, 0.1) };
+        let memory_bytes = 1000 * Surface::bytes(&built.layer.forest, 0);
+        let ask = Ask { memory_bytes, ..ask(built, &camera, 0.1) };
         let entries: HashMap<Diamond, Entry, RandomState> = built.entries.clone().into_iter().collect();
         let surfaces = surfaces(built, |_| true);
         let surfaces: HashMap<Diamond, Arc<Surface>, RandomState> = surfaces.into_iter().collect();

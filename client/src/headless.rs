@@ -129,8 +129,7 @@ pub fn framed(terrain: &mut Terrain, size: [u32; 2], exaggeration: f64, patience
 /// All points of a diamond that have a height.
 fn points_of(layer: &Layer, diamond: Diamond, block: &Block) -> impl Iterator<Item = DVec3> {
     let (local, n) = (layer.forest.local(diamond), block.segments());
-    let places = (0..=2 * n).flat_map(move |q| (q % 2..=2 * n).step_by(2).map(move |p| (p, q)));
-    places.filter(move |(p, q)| local.upper || q <= p).filter_map(move |(p, q)| {
+    block.places().filter(move |[p, q]| local.upper || q <= p).filter_map(move |[p, q]| {
         let height = block.heights()[Block::slot(n, p, q)];
         let (p, q) = (p as f64 / 2.0, q as f64 / 2.0);
         let along = |i: usize| {

@@ -11,6 +11,7 @@
 )]
 
 use diamantina_protocol::NODATA;
+use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::{Block, Diamond, walk_shared};
 use diamantina_protocol::message::Layer;
 use diamantina_protocol::points::{self, DecodeError, Tally};
@@ -39,37 +40,38 @@ impl Surface {
         payload: &[u8],
     ) -> Result<Self, DecodeError> {
         let forest = &layer.forest;
-        let mut block = Block::empty(forest);
+        let mut block = Block::empty(forest, d.level());
         let mut slopes = vec![[0.0f32; 2]; block.heights().len()];
         for (parent, surface) in parents {
             block.inherit(forest, d, *parent, &surface.block);
             walk_shared(forest, d, *parent, |to, from| slopes[to] = surface.slopes[from]);
         }
         let tally = points::decode(forest, &layer.coding, d, &mut block, payload)?;
-        let local = forest.local(d);
-        let n = forest.segments();
-        let (old, _) = block.parts();
-        let exists = |v: usize, u: usize| local.upper || v <= u;
-        let has_nodata = (0..=n).any(|v| (0..=n).any(|u| exists(v, u) && old[v * (n + 1) + u] == NODATA))
-            || (0..n).any(|v| {
-                (0..n).any(|u| exists(v, u) && block.heights()[(n + 1) * (n + 1) + v * n + u] == NODATA)
-            });
+        let (upper, n) = (forest.local(d).upper, block.segments());
+        let mut inside = block.places().filter(|[p, q]| upper || q <= p);
+        let has_nodata = inside.any(|[p, q]| block.heights()[Block::slot(n, p, q)] == NODATA);
         let mut surface = Self { block, slopes, has_nodata, tally };
         surface.slope(layer, d);
         Ok(surface)
     }
 
-    /// Slopes of the points strictly inside (and, at level 0, on the sides), by differences along the two
-    /// diagonals of the cells around them. Where all eight points around are there, the middle one of three
-    /// differences side by side counts twice (Horn 1981): a difference alone joins points of one colour of
-    /// the chessboard that old and new points make, and slopes of the two colours drift apart, which light
-    /// shows as teeth on steep ground.
+    /// Slopes of the points strictly inside (and, at level 0, on the sides), by differences along two axes: the
+    /// diagonals of the cells around a point, or, where centres are no points, the sides of the cells. Where all
+    /// eight points around are there, the middle one of three differences side by side counts twice (Horn 1981):
+    /// a difference alone joins points of one colour of the chessboard that old and new points make, and slopes
+    /// of the two colours drift apart, which light shows as teeth on steep ground.
     fn slope(&mut self, layer: &Layer, d: Diamond) {
         let local = layer.forest.local(d);
         let n = self.block.segments() as i64;
-        // Metres of half a unit of u and of v.
-        let half = |e: [i64; 2]| [e[0] as f64 * layer.cell[0] / 2.0, e[1] as f64 * layer.cell[1] / 2.0];
-        let (hu, hv) = (half(local.u), half(local.v));
+        // In doubled local coordinates.
+        let [e, f]: [[i64; 2]; 2] =
+            if self.block.has_centres() { [[1, 1], [1, -1]] } else { [[2, 0], [0, 2]] };
+        // Metres of a unit along an axis.
+        let metres = |[p, q]: [i64; 2]| {
+            [0, 1].map(|i| (local.u[i] * p + local.v[i] * q) as f64 * layer.cell[i] / 2.0)
+        };
+        let (along, across) = (metres(e), metres(f));
+        let det = along[0] * across[1] - along[1] * across[0];
         let height = |p: i64, q: i64| -> Option<f64> {
             if !(0..=2 * n).contains(&p) || !(0..=2 * n).contains(&q) || (!local.upper && q > p) {
                 return None;
@@ -77,8 +79,8 @@ impl Surface {
             let h = self.block.heights()[Block::slot(n as usize, p as usize, q as usize)];
             (h != NODATA).then_some(f64::from(h) * layer.quantum)
         };
-        // Rise a unit along (dp, dq), from both sides of a point where it can be.
-        let rise = |p: i64, q: i64, dp: i64, dq: i64| -> f64 {
+        // Rise a unit along an axis, from both sides of a point where it can be.
+        let rise = |p: i64, q: i64, [dp, dq]: [i64; 2]| -> f64 {
             let here = height(p, q);
             match (height(p - dp, q - dq), height(p + dp, q + dq), here) {
                 (Some(a), Some(b), _) => (b - a) / 2.0,
@@ -87,30 +89,28 @@ impl Surface {
                 _ => 0.0,
             }
         };
-        // The mean of the rises on both sides of a point, if their four points are there.
-        let beside = |p: i64, q: i64, [w, e, s, n]: [Option<f64>; 4]| -> Option<[f64; 2]> {
+        // The mean of the rises on both sides of a point, if the four points beside the axes are there.
+        let beside = |p: i64, q: i64| -> Option<[f64; 2]> {
             height(p, q)?;
-            let (w, e, s, n) = (w?, e?, s?, n?);
-            Some([(e - s + n - w) / 4.0, (e - n + s - w) / 4.0])
+            let at = |i: i64, j: i64| height(p + i * e[0] + j * f[0], q + i * e[1] + j * f[1]);
+            let (a, b, c, d) = (at(-1, -1)?, at(1, -1)?, at(1, 1)?, at(-1, 1)?);
+            Some([(b - a + c - d) / 4.0, (d - a + c - b) / 4.0])
         };
-        // The step along (1, 1) in metres, and the one along (1, -1).
-        let (e, f) = ([hu[0] + hv[0], hu[1] + hv[1]], [hu[0] - hv[0], hu[1] - hv[1]]);
-        let det = e[0] * f[1] - e[1] * f[0];
         let mut fresh = Vec::new();
-        for q in 0..=2 * n {
-            for p in (q % 2..=2 * n).step_by(2) {
-                let border = p == 0 || q == 0 || p == 2 * n || q == 2 * n;
-                if (border && d.level() > 0) || (!local.upper && q > p) {
-                    continue;
-                }
-                let (mut along, mut across) = (rise(p, q, 1, 1), rise(p, q, 1, -1));
-                let axes = [height(p - 2, q), height(p + 2, q), height(p, q - 2), height(p, q + 2)];
-                if let Some(beside) = beside(p, q, axes) {
-                    (along, across) = (f64::midpoint(along, beside[0]), f64::midpoint(across, beside[1]));
-                }
-                let slope = [(along * f[1] - across * e[1]) / det, (across * e[0] - along * f[0]) / det];
-                fresh.push((Block::slot(n as usize, p as usize, q as usize), slope.map(|s| s as f32)));
+        for [p, q] in self.block.places().map(|place| place.map(|w| w as i64)) {
+            let border = p == 0 || q == 0 || p == 2 * n || q == 2 * n;
+            if (border && d.level() > 0) || (!local.upper && q > p) {
+                continue;
             }
+            let mut rises = [rise(p, q, e), rise(p, q, f)];
+            if let Some(beside) = beside(p, q) {
+                rises = [0, 1].map(|i| f64::midpoint(rises[i], beside[i]));
+            }
+            let slope = [
+                (rises[0] * across[1] - rises[1] * along[1]) / det,
+                (rises[1] * along[0] - rises[0] * across[0]) / det,
+            ];
+            fresh.push((Block::slot(n as usize, p as usize, q as usize), slope.map(|s| s as f32)));
         }
         for (slot, slope) in fresh {
             self.slopes[slot] = slope;
@@ -141,9 +141,11 @@ impl Surface {
         self.tally
     }
 
-    /// Bytes of memory that a surface of this many segments takes.
+    /// Bytes of memory that the surface of a diamond of a level takes, with what a cache notes of it.
     #[must_use]
-    pub fn bytes(segments: usize) -> usize {
-        12 * ((segments + 1).pow(2) + segments.pow(2)) + size_of::<Self>()
+    pub fn bytes(forest: &Forest, level: u32) -> usize {
+        let n = forest.segments_at(level);
+        let centres = if forest.adds_points(level) || level % 2 == 1 { n * n } else { 0 };
+        12 * ((n + 1).pow(2) + centres) + size_of::<Self>()
     }
 }

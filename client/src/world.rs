@@ -48,13 +48,17 @@ fn pond(x: u32, y: u32) -> i32 {
     if (f64::from(x) - 150.0).hypot(f64::from(y) - 100.0) < 40.0 { 2900 + (x / 8) as i32 } else { NODATA }
 }
 
+fn forest(root_log2: u8, patch_log2: u8, roots: [u32; 2], precision: u8) -> Forest {
+    Forest::new(root_log2, patch_log2, roots).unwrap().with_precision(precision).unwrap()
+}
+
 /// The scene, made once: terrain of 1024 x 512 cells with two root squares, and a pond.
 pub(crate) fn world() -> &'static [Built] {
     static WORLD: OnceLock<Vec<Built>> = OnceLock::new();
     WORLD.get_or_init(|| {
         vec![
-            build("terrain", Kind::Terrain, Forest::new(9, 4, [2, 1]).unwrap(), [10.0, 10.0], hills),
-            build("water", Kind::Water, Forest::new(9, 3, [1, 1]).unwrap(), [10.0, 10.0], pond),
+            build("terrain", Kind::Terrain, forest(9, 4, [2, 1], 2), [10.0, 10.0], hills),
+            build("water", Kind::Water, forest(9, 3, [1, 1], 1), [10.0, 10.0], pond),
         ]
     })
 }
@@ -71,14 +75,17 @@ pub(crate) fn scene(layers: usize) -> Scene {
 
 fn build(name: &str, kind: Kind, forest: Forest, cell: [f64; 2], height: fn(u32, u32) -> i32) -> Built {
     let levels = forest.levels();
-    let exponents = (0..=levels).map(|l| ((levels - l) / 4).min(3) as u8).collect();
+    // All that is past the lattice, and some of what is on it, corrects.
+    let lattice = forest.lattice_levels();
+    let exponent = |l: u32| (levels - l.max(lattice)) + (lattice.saturating_sub(l) / 4).min(2);
+    let exponents = (0..=levels).map(|l| exponent(l) as u8).collect();
     let coding = Coding::new(Rule::Smooth, 3, exponents).unwrap();
     let quantum = 0.1;
     let diamonds: Vec<Diamond> = (0..levels).flat_map(|l| forest.diamonds(l)).collect();
     let mut blocks: HashMap<Diamond, Block> = HashMap::new();
     let (mut payloads, mut entries) = (HashMap::new(), HashMap::new());
     for d in &diamonds {
-        let (mut block, mut source) = (Block::empty(&forest), Block::empty(&forest));
+        let (mut block, mut source) = (Block::empty(&forest, d.level()), Block::empty(&forest, d.level()));
         for parent in forest.parents(*d) {
             block.inherit(&forest, *d, parent, &blocks[&parent]);
         }
@@ -134,8 +141,14 @@ fn entry(before: &Block, after: &Block, source: &Block, root: bool, quantum: f64
     let n = after.segments();
     let (old, new) = before.parts();
     let (old, _) = if root { after.parts() } else { (old, new) };
-    let mut most = 0;
-    for v in 0..n {
+    let (mut most, mut rows) = (0, 0..n);
+    if before.parts().1.iter().any(|h| *h != NODATA) || !after.has_centres() {
+        // Past the lattice known points move, and that is all.
+        rows = 0..0;
+        let moves = before.parts().1.iter().zip(after.parts().1).filter(|(a, _)| **a != NODATA);
+        most = moves.map(|(a, b)| (a - b).abs()).max().unwrap_or(0);
+    }
+    for v in rows {
         for u in 0..n {
             let at = v * (n + 1) + u;
             let corners = [old[at], old[at + 1], old[at + n + 2], old[at + n + 1]];
@@ -366,7 +379,7 @@ async fn batch(
         }
         let mut header = FrameHeader::of(centre, &payload);
         if state.happens(faults.damaged) {
-            payload[3] ^= 64;
+            damage(&mut payload);
         }
         if state.happens(faults.absurd / 8.0) {
             header.length = u32::MAX;
@@ -375,6 +388,12 @@ async fn batch(
         body.extend(payload);
     }
     in_pieces(&state, &faults, body)
+}
+
+/// Flips a bit: of the format, where there is little more.
+fn damage(payload: &mut [u8]) {
+    let at = if payload.len() > 3 { 3 } else { 0 };
+    payload[at] ^= 64;
 }
 
 /// The answer in pieces, cut off or late if so it happens.
@@ -429,7 +448,9 @@ async fn stream(
     let ask = message::parse_stream(query.iter().map(|(k, v)| (k.as_str(), v.as_str()))).unwrap();
     let mut body = Vec::new();
     let mut pages = HashSet::new();
-    for d in wanted(built, &ask) {
+    // 20 MB are as good as any number.
+    let most = if faults.heavy { 100 } else { usize::MAX };
+    for d in wanted(built, &ask).into_iter().take(most) {
         for around in forest.children(d).into_iter().flatten().chain([d]) {
             let page = index::page_of(forest, around);
             if pages.insert(page) {
@@ -449,7 +470,7 @@ async fn stream(
         let mut payload = if faults.heavy { vec![1; 200 << 10] } else { built.payloads[&d].clone() };
         let mut header = FrameHeader::of(d.centre(), &payload);
         if state.happens(faults.damaged) && !payload.is_empty() {
-            payload[3] ^= 64;
+            damage(&mut payload);
         }
         if state.happens(faults.absurd / 8.0) {
             header.length = u32::MAX;

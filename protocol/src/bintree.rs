@@ -32,6 +32,10 @@ pub const PATCH_LOG2: std::ops::RangeInclusive<u8> = 2..=7;
 /// an index within 32 bits.
 pub const PATCHES_LOG2_MAX: u32 = 36;
 
+/// The most levels past the finest lattice, unless patches are too small for them: see
+/// [`Forest::with_precision`].
+pub const PRECISION_MAX: u8 = 6;
+
 /// The squares that cover a layer, and how finely each is cut.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
 #[serde(try_from = "ForestParts", into = "ForestParts")]
@@ -39,6 +43,7 @@ pub struct Forest {
     root_log2: u8,
     patch_log2: u8,
     roots: [u32; 2],
+    precision: u8,
 }
 
 /// The JSON form of a [`Forest`].
@@ -47,6 +52,7 @@ struct ForestParts {
     root_log2: u8,
     patch_log2: u8,
     roots: [u32; 2],
+    precision: u8,
 }
 
 /// Why numbers do not describe a forest.
@@ -72,6 +78,14 @@ pub enum ForestError {
         /// The base-2 logarithm found, rounded up.
         found: u32,
     },
+    /// More levels past the finest lattice than patches have room for.
+    #[error("{found} levels past the finest lattice: expected at most {most}")]
+    Precision {
+        /// The number found.
+        found: u8,
+        /// The most.
+        most: u8,
+    },
     /// No root squares, or too many.
     #[error("{0} x {1} root squares: expected 1 to {ROOTS_MAX} along each axis")]
     Roots(u32, u32),
@@ -80,13 +94,13 @@ pub enum ForestError {
 impl TryFrom<ForestParts> for Forest {
     type Error = ForestError;
     fn try_from(p: ForestParts) -> Result<Self, ForestError> {
-        Self::new(p.root_log2, p.patch_log2, p.roots)
+        Self::new(p.root_log2, p.patch_log2, p.roots)?.with_precision(p.precision)
     }
 }
 
 impl From<Forest> for ForestParts {
     fn from(f: Forest) -> Self {
-        Self { root_log2: f.root_log2, patch_log2: f.patch_log2, roots: f.roots }
+        Self { root_log2: f.root_log2, patch_log2: f.patch_log2, roots: f.roots, precision: f.precision }
     }
 }
 
@@ -112,7 +126,22 @@ impl Forest {
         if squares > 1 << PATCHES_LOG2_MAX {
             return Err(ForestError::Patches { found: squares.next_power_of_two().trailing_zeros() });
         }
-        Ok(Self { root_log2, patch_log2, roots })
+        Ok(Self { root_log2, patch_log2, roots, precision: 0 })
+    }
+
+    /// The same with `levels` past the finest lattice: their diamonds add no points, they only make those
+    /// that are there more precise. Each of them has half of the points of one of the level before.
+    ///
+    /// # Errors
+    /// Beyond [`PRECISION_MAX`], and where a diamond of the last one would have less than two segments a side.
+    pub fn with_precision(self, levels: u8) -> Result<Self, ForestError> {
+        let most = PRECISION_MAX.min(2 * self.patch_log2 - 1);
+        let squares = (u64::from(self.roots[0]) * u64::from(self.roots[1]))
+            << (2 * u32::from(self.root_log2 - self.patch_log2));
+        if levels > most || squares << levels > 1 << PATCHES_LOG2_MAX {
+            return Err(ForestError::Precision { found: levels, most });
+        }
+        Ok(Self { precision: levels, ..self })
     }
 
     /// The forest for a grid of `width` by `height` samples: the shorter side fits one root square,
@@ -137,7 +166,7 @@ impl Forest {
     /// One root square of 2^`root_log2` cells, for its addresses alone: not for streaming, since it may be
     /// smaller than any patch. `root_log2` at most [`ROOT_LOG2_MAX`].
     pub(crate) fn single(root_log2: u8) -> Self {
-        Self { root_log2: root_log2.min(ROOT_LOG2_MAX), patch_log2: 0, roots: [1, 1] }
+        Self { root_log2: root_log2.min(ROOT_LOG2_MAX), patch_log2: 0, roots: [1, 1], precision: 0 }
     }
 
     /// Base-2 logarithm of the cells along a root square's side.
@@ -152,7 +181,7 @@ impl Forest {
         u32::from(self.patch_log2)
     }
 
-    /// Segments along each side of a patch: n.
+    /// Segments along each side of a patch on the lattice: n.
     #[must_use]
     pub fn segments(&self) -> usize {
         1 << self.patch_log2
@@ -164,11 +193,26 @@ impl Forest {
         self.roots
     }
 
-    /// How many levels of diamonds split. Triangles of this level are drawn from source samples one
-    /// cell apart, and split no further. Even, and at least 2.
+    /// How many levels of diamonds split: those of the lattice, then those that only add precision.
     #[must_use]
     pub fn levels(&self) -> u32 {
+        self.lattice_levels() + u32::from(self.precision)
+    }
+
+    /// How many levels of diamonds add points. Triangles of this level are drawn from source samples one
+    /// cell apart. Even, and at least 2.
+    #[must_use]
+    pub fn lattice_levels(&self) -> u32 {
         2 * (self.root_log2() - self.patch_log2())
+    }
+
+    /// Segments along each side of a diamond of a level: n on the lattice; past it the cells stay as they
+    /// are, and diamonds have fewer of them.
+    #[must_use]
+    pub fn segments_at(&self, level: u32) -> usize {
+        let past = level.saturating_sub(self.lattice_levels());
+        let halvings = if level < self.lattice_levels() { 0 } else { past.div_ceil(2) };
+        1 << (self.patch_log2() - halvings)
     }
 
     /// The largest lattice coordinates, in cells.
@@ -309,7 +353,7 @@ mod tests {
         assert_eq!(Forest::new(24, 2, [15, 15]), Err(ForestError::Patches { found: 52 }));
         assert!(serde_json_like(9, 12).is_err());
         fn serde_json_like(root_log2: u8, patch_log2: u8) -> Result<Forest, ForestError> {
-            ForestParts { root_log2, patch_log2, roots: [1, 1] }.try_into()
+            ForestParts { root_log2, patch_log2, roots: [1, 1], precision: 0 }.try_into()
         }
     }
 

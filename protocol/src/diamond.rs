@@ -21,6 +21,12 @@
 //!     a-----1-----+  u     there are no cracks.
 //! ```
 //!
+//! **Past the finest lattice** diamonds split on, as names and regions, but there are no points left to
+//! add: the cells stay one sample wide, and each level halves the points of a diamond. Of an even level
+//! the local grid has (m+1)^2 old points and no others; of an odd level, whose grid is turned by 45 degrees,
+//! the m^2 centres of its cells are known already, like the old ones. A split only makes the points
+//! strictly inside more precise, so all that holds of the lattice's levels holds of these.
+//!
 //! After Cignoni et al., *BDAM: Batched Dynamic Adaptive Meshes* (2003), and Gobbetti et al., *C-BDAM*
 //! (2006), whose diamonds these are.
 
@@ -57,6 +63,12 @@ pub struct Local {
 }
 
 impl Forest {
+    /// Whether a split at `level` adds points: the centres of its cells.
+    #[must_use]
+    pub fn adds_points(&self, level: u32) -> bool {
+        level < self.lattice_levels()
+    }
+
     /// The diamond with this centre, or `None` where no diamond of a level that splits is centred.
     #[must_use]
     pub fn diamond(&self, [x, y]: Point) -> Option<Diamond> {
@@ -113,7 +125,7 @@ impl Forest {
             (a, b) = (b, a);
             (lower, upper) = (upper, lower);
         }
-        let n = 1i64 << self.patch_log2();
+        let n = self.segments_at(d.level()) as i64;
         let u = [(lower[0] - a[0]) / n, (lower[1] - a[1]) / n];
         let v = [(b[0] - lower[0]) / n, (b[1] - lower[1]) / n];
         Local { origin: a, u, v, upper: self.inside(upper), n }
@@ -174,6 +186,7 @@ impl Forest {
     /// longer cell alike: lattice steps along x and y of the longer one. Level may be [`Forest::levels`].
     #[must_use]
     pub fn hypotenuse(&self, level: u32) -> [f64; 2] {
+        let level = level.min(self.lattice_levels());
         let spacing = f64::from(1u32 << (self.root_log2() - self.patch_log2() - level / 2));
         // An odd level's cells are turned by 45 degrees: their hypotenuse lies along one axis.
         if level.is_multiple_of(2) { [spacing, spacing] } else { [spacing, 0.0] }
@@ -218,9 +231,9 @@ impl Local {
     }
 }
 
-/// The heights of a diamond once it is split: old points and new ones, in quanta.
+/// The heights of a diamond once it is split: old points and the centres of cells, in quanta.
 ///
-/// Takes `4 ((n+1)^2 + n^2)` bytes: 33 kB for n = 64.
+/// Takes `4 ((n+1)^2 + n^2)` bytes: 33 kB for n = 64. An even level past the finest lattice has no centres.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Block {
     n: usize,
@@ -228,11 +241,12 @@ pub struct Block {
 }
 
 impl Block {
-    /// A block without heights.
+    /// A block without heights, for a diamond of a level.
     #[must_use]
-    pub fn empty(forest: &Forest) -> Self {
-        let n = forest.segments();
-        Self { n, heights: vec![NODATA; (n + 1) * (n + 1) + n * n] }
+    pub fn empty(forest: &Forest, level: u32) -> Self {
+        let n = forest.segments_at(level);
+        let centres = if forest.adds_points(level) || level % 2 == 1 { n * n } else { 0 };
+        Self { n, heights: vec![NODATA; (n + 1) * (n + 1) + centres] }
     }
 
     /// Segments a side.
@@ -241,18 +255,24 @@ impl Block {
         self.n
     }
 
-    /// Old points, rows of n+1 along u, then new points, rows of n.
+    /// Whether the centres of the cells are points, too.
+    #[must_use]
+    pub fn has_centres(&self) -> bool {
+        self.heights.len() > (self.n + 1) * (self.n + 1)
+    }
+
+    /// Old points, rows of n+1 along u, then centres, rows of n.
     #[must_use]
     pub fn heights(&self) -> &[i32] {
         &self.heights
     }
 
-    /// The old points, row v after row v, each of n+1 heights; and the new ones, rows of n.
+    /// The old points, row v after row v, each of n+1 heights; and the centres, rows of n.
     pub fn parts_mut(&mut self) -> (&mut [i32], &mut [i32]) {
         self.heights.split_at_mut((self.n + 1) * (self.n + 1))
     }
 
-    /// The old points and the new ones.
+    /// The old points and the centres.
     #[must_use]
     pub fn parts(&self) -> (&[i32], &[i32]) {
         self.heights.split_at((self.n + 1) * (self.n + 1))
@@ -264,21 +284,32 @@ impl Block {
         if p.is_multiple_of(2) { q / 2 * (n + 1) + p / 2 } else { (n + 1) * (n + 1) + q / 2 * n + p / 2 }
     }
 
-    /// Fills in, from `parent`'s split, the old points of `child` that lie in the triangle they share.
+    /// Doubled local coordinates of every point of the block's square, row by row.
+    pub fn places(&self) -> impl Iterator<Item = [usize; 2]> + use<> {
+        let (n, step) = (self.n, if self.has_centres() { 1 } else { 2 });
+        (0..=2 * n).step_by(step).flat_map(move |q| (q % 2..=2 * n).step_by(2).map(move |p| [p, q]))
+    }
+
+    /// Fills in, from `parent`'s split, the points of `child` that are known and lie in the triangle they
+    /// share.
     ///
-    /// Both parents together give a child all its old points; those on the shared hypotenuse come from
+    /// Both parents together give a child all of them; those on the shared hypotenuse come from
     /// either, and are equal, since no split moves its own border.
     pub fn inherit(&mut self, forest: &Forest, child: Diamond, parent: Diamond, from: &Self) {
+        if !from.has_centres() {
+            walk_shared(forest, child, parent, |to, slot| self.heights[to] = from.heights[slot]);
+            return;
+        }
         let n = self.n;
         let shared = Shared::new(forest, child, parent);
         for j in 0..=n {
             let (first, last) = shared.columns(n, j);
-            // Along a row, old points of the parent alternate with new ones: each kind lies at even steps.
+            // Along a row, old points of the parent alternate with centres: each kind lies at even steps.
             for i in first..=last.min(first + 1) {
-                let [p, q] = shared.at(i, j);
-                let [p2, q2] = shared.at(i + 2, j);
-                let mut slot = Self::slot(n, p as usize, q as usize) as i64;
-                let row = (n + usize::from(p % 2 == 0)) as i64;
+                let [p, q] = shared.at2(2 * i, 2 * j);
+                let [p2, q2] = shared.at2(2 * i + 4, 2 * j);
+                let mut slot = Self::slot(from.n, p as usize, q as usize) as i64;
+                let row = (from.n + usize::from(p % 2 == 0)) as i64;
                 let step = (q2 - q) / 2 * row + (p2 - p) / 2;
                 for to in self.heights[j * (n + 1) + i..=j * (n + 1) + last].iter_mut().step_by(2) {
                     *to = from.heights[slot as usize];
@@ -290,13 +321,10 @@ impl Block {
 
     /// Reads every point of the block from the lattice: `height(x, y)`. Points outside stay empty.
     pub fn fill(&mut self, local: &Local, mut height: impl FnMut(u32, u32) -> i32) {
-        let n = self.n;
-        for q in 0..=2 * n {
-            for p in (q % 2..=2 * n).step_by(2) {
-                if local.upper || q <= p {
-                    let [x, y] = local.lattice2([p as i64, q as i64]);
-                    self.heights[Self::slot(n, p, q)] = height(x as u32, y as u32);
-                }
+        for [p, q] in self.places() {
+            if local.upper || q <= p {
+                let [x, y] = local.lattice2([p as i64, q as i64]);
+                self.heights[Self::slot(self.n, p, q)] = height(x as u32, y as u32);
             }
         }
     }
@@ -314,16 +342,15 @@ struct Shared {
 
 impl Shared {
     fn new(forest: &Forest, child: Diamond, parent: Diamond) -> Self {
-        let n = forest.segments() as i64;
         let (c, p) = (forest.local(child), forest.local(parent));
         // The child's local grid seen from the parent's: a turn by an odd multiple of 45 degrees.
         let origin = p.local2(c.origin);
         let along = |e: [i64; 2]| {
-            let tip = p.local2([c.origin[0] + e[0] * n, c.origin[1] + e[1] * n]);
-            [(tip[0] - origin[0]) / n, (tip[1] - origin[1]) / n]
+            let tip = p.local2([c.origin[0] + e[0] * c.n, c.origin[1] + e[1] * c.n]);
+            [(tip[0] - origin[0]) / c.n, (tip[1] - origin[1]) / c.n]
         };
         let centre = [i64::from(parent.x), i64::from(parent.y)];
-        Self { origin, u: along(c.u), v: along(c.v), lower: c.lattice2([2 * n, 0]) == centre }
+        Self { origin, u: along(c.u), v: along(c.v), lower: c.lattice2([2 * c.n, 0]) == centre }
     }
 
     /// The first and last column of a row of the child's old points that lie in the triangle.
@@ -331,23 +358,25 @@ impl Shared {
         if self.lower { (row, n) } else { (0, row) }
     }
 
-    /// The parent's doubled coordinates of the child's old point (i, j).
-    fn at(&self, i: usize, j: usize) -> [i64; 2] {
-        let (i, j) = (i as i64, j as i64);
-        [self.origin[0] + self.u[0] * i + self.v[0] * j, self.origin[1] + self.u[1] * i + self.v[1] * j]
+    /// The parent's doubled coordinates of the child's.
+    fn at2(&self, p: usize, q: usize) -> [i64; 2] {
+        let (p, q) = (p as i64, q as i64);
+        [0, 1].map(|axis| self.origin[axis] + (self.u[axis] * p + self.v[axis] * q) / 2)
     }
 }
 
-/// Calls `copy(slot of the child's old point, slot in the parent's block)` for each point of the
-/// triangle that `child` takes from `parent`.
+/// Calls `copy(slot of the child's point, slot in the parent's block)` for each point of the triangle that
+/// `child` takes from `parent`, as far as the parent has it.
 pub fn walk_shared(forest: &Forest, child: Diamond, parent: Diamond, mut copy: impl FnMut(usize, usize)) {
-    let n = forest.segments();
+    let (n, from) = (forest.segments_at(child.level()), forest.segments_at(parent.level()));
     let shared = Shared::new(forest, child, parent);
-    for j in 0..=n {
-        let (first, last) = shared.columns(n, j);
-        for i in first..=last {
-            let [p, q] = shared.at(i, j);
-            copy(j * (n + 1) + i, Block::slot(n, p as usize, q as usize));
+    // Past the finest lattice all is known; before, centres are what the child is about to add.
+    let centres = !forest.adds_points(child.level()) && child.level() % 2 == 1;
+    for q in (0..=2 * n).step_by(if centres { 1 } else { 2 }) {
+        let (first, last) = if shared.lower { (q, 2 * n) } else { (q % 2, q) };
+        for p in (first..=last).step_by(2) {
+            let [p2, q2] = shared.at2(p, q);
+            copy(Block::slot(n, p, q), Block::slot(from, p2 as usize, q2 as usize));
         }
     }
 }

@@ -114,7 +114,7 @@ pub fn declared(metres: f32) -> f32 {
 
 /// Depths of a root's quadtree whose squares own diamonds.
 fn depths(forest: &Forest) -> u32 {
-    forest.levels() / 2
+    forest.levels().div_ceil(2)
 }
 
 /// Squares of a depth along x and y.

@@ -203,19 +203,17 @@ impl Grid {
         let [width, height] = layer.samples.map(i64::from);
         let heights = vec![NODATA; (width * height) as usize];
         let mut grid = Self { width, height, heights, far: layer.forest.size().map(i64::from) };
-        let n = layer.forest.segments();
         decode_levels(store, number, layer, entries, |level, blocks| {
             if level + 1 < layer.forest.levels() {
                 return;
             }
             for (d, block, _) in blocks {
                 let local = layer.forest.local(*d);
-                for q in 0..=2 * n {
-                    for p in (q % 2..=2 * n).step_by(2).filter(|p| local.upper || q <= *p) {
-                        let [x, y] = local.lattice2([p as i64, q as i64]);
-                        if x < width && y < height {
-                            grid.heights[(y * width + x) as usize] = block.heights()[Block::slot(n, p, q)];
-                        }
+                for [p, q] in block.places().filter(|[p, q]| local.upper || q <= p) {
+                    let [x, y] = local.lattice2([p as i64, q as i64]);
+                    if x < width && y < height {
+                        let slot = Block::slot(block.segments(), p, q);
+                        grid.heights[(y * width + x) as usize] = block.heights()[slot];
                     }
                 }
             }
@@ -232,7 +230,9 @@ impl Grid {
             let mut found = Found::default();
             if side < 2 || split.local.upper {
                 let ends = [corners[side], corners[(side + 1) % 4], [m / 2, m / 2]];
-                split.bisect(ends.map(|p| split.corner(p)), 2 * layer.forest.patch_log2(), &mut found);
+                // A side's triangle has n^2 small ones, or half as many where centres are no points.
+                let depth = 2 * block.segments().ilog2() - u32::from(!block.has_centres());
+                split.bisect(ends.map(|p| split.corner(p)), depth, &mut found);
             }
             found
         })

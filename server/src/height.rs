@@ -122,25 +122,16 @@ pub fn height(
         (false, true) => [([i, j], 1.0 - s - t), ([i + 1, j], s), ([i, j + 1], t)],
         (false, false) => [([i + 1, j], 1.0 - t), ([i, j + 1], 1.0 - s), ([i + 1, j + 1], s + t - 1.0)],
     };
-    let n = layer.forest.segments() as u32;
-    // The triangle of the finest level is half of a square of n cells; its apex is the corner off the
-    // diagonal, and centres the diamond whose split drew it.
-    let square = [i / n, j / n];
-    // Told by the centroid of the small triangle: a sample may lie on the diagonal, a centroid never does, and
-    // all three corners are then in the diamond's block.
-    let [u, v] = [0, 1]
-        .map(|axis| corners.iter().map(|(c, _)| f64::from(c[axis] - square[axis] * n)).sum::<f64>() / 3.0);
-    let side = f64::from(n);
-    let rising = (square[0] + square[1]).is_multiple_of(2);
-    let (east, north) = if rising { (u >= v, u < v) } else { (u + v > side, u + v > side) };
-    let apex = [(square[0] + u32::from(east)) * n, (square[1] + u32::from(north)) * n];
+    // Told by the centroid of the small triangle: a sample may lie on a side of a diamond's triangles, a centroid
+    // never does, and all three corners are then in one diamond's block.
+    let centroid = [0, 1].map(|axis| corners.iter().map(|(c, _)| f64::from(c[axis])).sum::<f64>() / 3.0);
     let mut height = Some(0.0);
-    if let Some(d) = layer.forest.diamond(apex) {
+    if let Some(d) = finest(layer, centroid) {
         let block = decode(store, number, layer, d, &mut HashMap::new())?;
         let local = layer.forest.local(d);
         for (corner, weight) in corners {
             let [p, q] = local.local2(corner.map(i64::from));
-            let h = block.heights()[Block::slot(n as usize, p as usize, q as usize)];
+            let h = block.heights()[Block::slot(block.segments(), p as usize, q as usize)];
             let part = (h != NODATA).then(|| f64::from(h) * weight);
             // A corner without weight, but for rounding, has no say: on an edge, what lies beyond may be nodata.
             height = match (height, part) {
@@ -150,7 +141,7 @@ pub fn height(
             };
         }
     } else {
-        return Err(HeightError::Damaged(format!("no diamond at {apex:?}")));
+        return Err(HeightError::Damaged(format!("no diamond at {centroid:?}")));
     }
     let lonlat = to_lonlat(crs, [x, y]);
     let metres = height.map(|h| h * layer.quantum + layer.height_offset);
@@ -174,6 +165,37 @@ fn in_cells(coordinate: f64, origin: f64, cell: f64) -> (f64, f64) {
     (if (at - at.round()).abs() <= rounding { at.round() } else { at }, rounding)
 }
 
+/// The diamond whose split draws the finest triangle around a place, in cells, that is on no triangle's side.
+fn finest(layer: &Layer, place: [f64; 2]) -> Option<Diamond> {
+    let forest = &layer.forest;
+    let half = 1u32 << (forest.root_log2() - 1);
+    let roots = forest.roots();
+    let centre = [0, 1].map(|axis| {
+        let root = (place[axis] as u32 >> forest.root_log2()).min(roots[axis] - 1);
+        (2 * root + 1) * half
+    });
+    let mut d = forest.diamond(centre)?;
+    loop {
+        // Of the four triangles of the split, the one that lies on the place's side of both diagonals.
+        let local = forest.local(d);
+        let along = |e: [i64; 2]| {
+            let w = [0, 1].map(|axis| place[axis] - local.origin[axis] as f64);
+            (w[0] * e[0] as f64 + w[1] * e[1] as f64) / (e[0] * e[0] + e[1] * e[1]) as f64
+        };
+        let (u, v) = (along(local.u), along(local.v));
+        let side = match (u > v, u + v > forest.segments_at(d.level()) as f64) {
+            (true, false) => 0,
+            (true, true) => 1,
+            (false, true) => 2,
+            (false, false) => 3,
+        };
+        match forest.children(d)[side] {
+            Some(child) => d = child,
+            None => return Some(d),
+        }
+    }
+}
+
 /// Decodes a diamond with its ancestors.
 fn decode(
     store: &Store,
@@ -185,7 +207,7 @@ fn decode(
     if let Some(block) = done.get(&d) {
         return Ok(block.clone());
     }
-    let mut block = Block::empty(&layer.forest);
+    let mut block = Block::empty(&layer.forest, d.level());
     for parent in layer.forest.parents(d) {
         let from = decode(store, number, layer, parent, done)?;
         block.inherit(&layer.forest, d, parent, &from);

@@ -271,7 +271,7 @@ impl Payloads<'_> {
         let filled = diamonds.into_par_iter().filter(|d| self.entries.get(d).is_some_and(|e| !e.is_empty()));
         filled
             .map(|d| {
-                let mut block = Block::empty(forest);
+                let mut block = Block::empty(forest, d.level());
                 for parent in forest.parents(d) {
                     if let Some(from) = before.get(&parent) {
                         block.inherit(forest, d, parent, from);

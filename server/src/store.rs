@@ -42,7 +42,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use xxhash_rust::xxh3::xxh3_64;
 
 /// The format that this build writes, and the only one that it reads.
-pub const FORMAT: u32 = 2;
+pub const FORMAT: u32 = 3;
 
 /// A pack is closed once it holds this many bytes.
 const PACK_BYTES: u64 = 32 << 20;

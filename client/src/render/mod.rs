@@ -332,7 +332,7 @@ impl Renderer {
         let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         {
             let mut pass = begin_pass(&mut encoder, &attachments, view, look, self.options.format);
-            self.draw_terrain(&mut pass, layers, &draws, &mut stats);
+            self.draw_terrain(&mut pass, &draws, &mut stats);
             if look.background == Background::Sky {
                 pass.set_pipeline(&self.sky);
                 pass.set_bind_group(0, &self.frame_group, &[]);
@@ -426,7 +426,6 @@ impl Renderer {
     fn draw_terrain(
         &self,
         pass: &mut wgpu::RenderPass<'_>,
-        layers: &[Layer],
         draws: &[Draw<'_>],
         stats: &mut FrameStats,
     ) {
@@ -434,14 +433,17 @@ impl Renderer {
         pass.set_pipeline(&self.terrain);
         pass.set_bind_group(0, &self.frame_group, &[]);
         pass.set_vertex_buffer(2, instances.slice(..));
-        let (mut layer_now, mut triangles_now) = (None, None::<&Triangles>);
+        let (mut layer_now, mut places_now, mut triangles_now) = (None, None, None::<&Triangles>);
         for (draw, instance) in draws.iter().zip(0u32..) {
-            let grid = self.residents.grid(layers[draw.item.layer].forest.segments());
+            let grid = self.residents.grid(draw.item);
             let (Some(grid), Some(resident)) = (grid, self.residents.get(draw.item)) else { continue };
             if layer_now != Some(draw.item.layer) {
                 layer_now = Some(draw.item.layer);
                 let offset = u32::try_from(LAYER_STRIDE * draw.item.layer).unwrap_or(0);
                 pass.set_bind_group(1, layer_group, &[offset]);
+            }
+            if places_now != Some(&grid.places) {
+                places_now = Some(&grid.places);
                 pass.set_vertex_buffer(0, grid.places.slice(..));
             }
             let triangles = resident.own.as_ref().unwrap_or(&grid.triangles);

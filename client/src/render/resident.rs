@@ -3,7 +3,7 @@
 //! A surface takes 8 bytes a point (66 kB for n = 64) and, if it has nodata, its own index lists (up to
 //! 98 kB). Those that the present frame draws always stay; of the others, the longest unseen go first.
 
-use super::triangles::{self, Lists};
+use super::triangles::{self, Form, Lists};
 use crate::camera::Bounds;
 use crate::drawing::DrawItem;
 use crate::surface::Surface;
@@ -24,7 +24,7 @@ pub(super) struct SurfacePoint {
     normal: [i16; 2],
 }
 
-/// What all diamonds of n segments share.
+/// What all diamonds of a form share.
 pub(super) struct Grid {
     /// Doubled local coordinates of each slot.
     pub(super) places: wgpu::Buffer,
@@ -62,12 +62,12 @@ pub(super) struct Residents {
     bytes: u64,
     frame: u64,
     by_key: HashMap<Key, Resident>,
-    by_segments: HashMap<usize, Grid>,
+    by_form: HashMap<Form, Grid>,
 }
 
 impl Residents {
     pub(super) fn new(budget_bytes: u64) -> Self {
-        Self { budget_bytes, bytes: 0, frame: 0, by_key: HashMap::new(), by_segments: HashMap::new() }
+        Self { budget_bytes, bytes: 0, frame: 0, by_key: HashMap::new(), by_form: HashMap::new() }
     }
 
     /// Bytes of GPU memory that surfaces take.
@@ -79,8 +79,8 @@ impl Residents {
         self.by_key.get(&(item.layer, item.diamond))
     }
 
-    pub(super) fn grid(&self, segments: usize) -> Option<&Grid> {
-        self.by_segments.get(&segments)
+    pub(super) fn grid(&self, item: &DrawItem) -> Option<&Grid> {
+        self.by_form.get(&Form::of(item.surface.block()))
     }
 
     /// Starts a frame that draws these items: uploads those that are not there yet, and drops others if
@@ -90,12 +90,12 @@ impl Residents {
         let mut uploaded_bytes = 0;
         for item in items {
             let Some(layer) = layers.get(item.layer) else { continue };
-            let n = layer.forest.segments();
-            if item.surface.block().segments() != n {
+            let form = Form::of(item.surface.block());
+            if form.segments != layer.forest.segments_at(item.diamond.level()) {
                 continue;
             }
             let key = (item.layer, item.diamond);
-            self.by_segments.entry(n).or_insert_with(|| Grid::new(device, n));
+            self.by_form.entry(form).or_insert_with(|| Grid::new(device, form));
             if let Some(resident) = self.by_key.get_mut(&key)
                 && std::ptr::eq(resident.surface.as_ptr(), Arc::as_ptr(&item.surface))
             {
@@ -133,13 +133,13 @@ impl Residents {
 }
 
 impl Grid {
-    fn new(device: &wgpu::Device, n: usize) -> Self {
+    fn new(device: &wgpu::Device, form: Form) -> Self {
         let places = device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
             label: Some("places"),
-            contents: bytemuck::cast_slice(&triangles::places(n)),
+            contents: bytemuck::cast_slice(&triangles::places(form)),
             usage: wgpu::BufferUsages::VERTEX,
         });
-        Self { places, triangles: Triangles::new(device, triangles::lists(n, |_| true)) }
+        Self { places, triangles: Triangles::new(device, triangles::lists(form, |_| true)) }
     }
 }
 

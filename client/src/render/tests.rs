@@ -40,13 +40,16 @@ struct World {
 impl World {
     /// `height` gives quanta, of 0.1 m, at lattice points.
     fn new(forest: Forest, cell: f64, height: impl Fn(u32, u32) -> i32) -> Self {
-        let coding = Coding::new(Rule::Smooth, 3, vec![0; forest.levels() as usize + 1]).unwrap();
+        // Past the lattice there is something to correct.
+        let (levels, lattice) = (forest.levels(), forest.lattice_levels());
+        let exponents = (0..=levels).map(|l| (levels - l.max(lattice)) as u8).collect();
+        let coding = Coding::new(Rule::Smooth, 3, exponents).unwrap();
         let mut blocks: HashMap<Diamond, Block> = HashMap::new();
         let mut payloads = Vec::new();
         let mut range = [i32::MAX, i32::MIN];
         for level in 0..forest.levels() {
             for d in forest.diamonds(level) {
-                let mut source = Block::empty(&forest);
+                let mut source = Block::empty(&forest, level);
                 source.fill(&forest.local(d), |x, y| {
                     let h = height(x, y);
                     if h != NODATA {
@@ -54,7 +57,7 @@ impl World {
                     }
                     h
                 });
-                let mut block = Block::empty(&forest);
+                let mut block = Block::empty(&forest, level);
                 for parent in forest.parents(d) {
                     block.inherit(&forest, d, parent, &blocks[&parent]);
                 }
@@ -204,7 +207,7 @@ fn rough(x: u32, y: u32) -> i32 {
 #[test]
 fn the_whole_forest_is_covered_and_nothing_else() {
     // Heights fall to 0 at the border, gently enough that nothing leans over the outline.
-    let forest = Forest::new(5, 3, [2, 1]).unwrap();
+    let forest = Forest::new(5, 3, [2, 1]).unwrap().with_precision(3).unwrap();
     let [w, h] = forest.size();
     let to_border = |x: u32, y: u32| x.min(y).min(w - x).min(h - y).cast_signed();
     let world = World::new(forest, 30.0, |x, y| rough(x, y).min(60 * to_border(x, y)));
@@ -234,7 +237,7 @@ fn the_whole_forest_is_covered_and_nothing_else() {
 
 #[test]
 fn mixed_levels_have_no_cracks() {
-    let world = World::new(Forest::new(6, 2, [3, 2]).unwrap(), 30.0, rough);
+    let world = World::new(Forest::new(6, 2, [3, 2]).unwrap().with_precision(3).unwrap(), 30.0, rough);
     let camera = Camera {
         eye: world.place(0.5, 0.25, 900.0),
         target: world.place(0.5, 0.5, 100.0),

@@ -11,7 +11,9 @@
 //!   +-------+
 //! ```
 //!
-//! Each list has n^2 triangles, which turn left seen from above.
+//! Each list has n^2 triangles, which turn left seen from above. Where centres are no points (see
+//! [`diamantina_protocol::diamond`]), cells have two triangles, cut along diagonals that alternate as the
+//! bintree's do, and each list has n^2 / 2.
 
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::Block;
@@ -26,18 +28,46 @@ pub(super) struct Lists {
     pub(super) sides: [Range<u32>; 4],
 }
 
-/// The lists of a diamond of `n` segments, of those triangles whose three slots `keep` wants.
-pub(super) fn lists(n: usize, keep: impl Fn(usize) -> bool) -> Lists {
+/// The form of a local grid: what all diamonds of this many segments, with centres or without, share.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) struct Form {
+    pub(super) segments: usize,
+    pub(super) centres: bool,
+}
+
+impl Form {
+    pub(super) fn of(block: &Block) -> Self {
+        Self { segments: block.segments(), centres: block.has_centres() }
+    }
+}
+
+/// The lists of a diamond, of those triangles whose three slots `keep` wants.
+pub(super) fn lists(form: Form, keep: impl Fn(usize) -> bool) -> Lists {
+    let n = form.segments;
     let mut parts: [Vec<u16>; 4] = std::array::from_fn(|_| Vec::new());
     for v in 0..n {
         for u in 0..n {
-            let apex = Block::slot(n, 2 * u + 1, 2 * v + 1);
             let corner = |du: usize, dv: usize| Block::slot(n, 2 * (u + du), 2 * (v + dv));
             let corners = [corner(0, 0), corner(1, 0), corner(1, 1), corner(0, 1)];
-            for side in 0..4 {
-                let triangle = [corners[side], corners[(side + 1) % 4], apex];
+            let mut add = |side: usize, triangle: [usize; 3]| {
                 if triangle.iter().all(|slot| keep(*slot)) {
-                    parts[side_of(n, u, v, side)].extend(triangle.map(|s| u16::try_from(s).unwrap_or(0)));
+                    parts[side].extend(triangle.map(|s| u16::try_from(s).unwrap_or(0)));
+                }
+            };
+            if form.centres {
+                let apex = Block::slot(n, 2 * u + 1, 2 * v + 1);
+                for (side, centroid) in [[3, 1], [5, 3], [3, 5], [1, 3]].into_iter().enumerate() {
+                    add(side_of(n, u, v, centroid), [corners[side], corners[(side + 1) % 4], apex]);
+                }
+            } else {
+                let [a, b, c, d] = corners;
+                let halves = if (u + v).is_multiple_of(2) {
+                    [([a, b, c], [4, 2]), ([a, c, d], [2, 4])]
+                } else {
+                    [([a, b, d], [2, 2]), ([b, c, d], [4, 4])]
+                };
+                for (triangle, centroid) in halves {
+                    add(side_of(n, u, v, centroid), triangle);
                 }
             }
         }
@@ -53,13 +83,13 @@ pub(super) fn lists(n: usize, keep: impl Fn(usize) -> bool) -> Lists {
 
 /// The lists of a diamond with nodata: triangles with a point that has no height are dropped.
 pub(super) fn lists_of(block: &Block) -> Lists {
-    lists(block.segments(), |slot| block.heights()[slot] != NODATA)
+    lists(Form::of(block), |slot| block.heights()[slot] != NODATA)
 }
 
-/// The triangle of the split in which the micro-triangle over `side` of the cell (u, v) lies.
-fn side_of(n: usize, u: usize, v: usize, side: usize) -> usize {
-    // Three times the centroid in doubled coordinates; the diamond's centre is at 3n.
-    let [east, north] = [[3, 1], [5, 3], [3, 5], [1, 3]][side];
+/// The triangle of the split in which a micro-triangle of the cell (u, v) lies. Its centroid is given as three
+/// times its doubled coordinates in the cell.
+fn side_of(n: usize, u: usize, v: usize, [east, north]: [usize; 2]) -> usize {
+    // The diamond's centre is at 3n.
     let (x, y, centre) = (6 * u + east, 6 * v + north, 3 * n);
     match (x.abs_diff(centre) > y.abs_diff(centre), x > centre, y > centre) {
         (true, true, _) => 1,
@@ -69,10 +99,12 @@ fn side_of(n: usize, u: usize, v: usize, side: usize) -> usize {
     }
 }
 
-/// Doubled local coordinates (2u, 2v) of each slot of a block of `n` segments.
-pub(super) fn places(n: usize) -> Vec<[u16; 2]> {
-    let mut places = vec![[0; 2]; (n + 1) * (n + 1) + n * n];
-    for q in 0..=2 * n {
+/// Doubled local coordinates (2u, 2v) of each slot of a block.
+pub(super) fn places(form: Form) -> Vec<[u16; 2]> {
+    let n = form.segments;
+    let step = if form.centres { 1 } else { 2 };
+    let mut places = vec![[0; 2]; (n + 1) * (n + 1) + if form.centres { n * n } else { 0 }];
+    for q in (0..=2 * n).step_by(step) {
         for p in (q % 2..=2 * n).step_by(2) {
             places[Block::slot(n, p, q)] = [p, q].map(|i| u16::try_from(i).unwrap_or(0));
         }
@@ -87,8 +119,16 @@ mod tests {
 
     type Place = [i64; 2];
 
+    fn form(segments: usize) -> Form {
+        Form { segments, centres: true }
+    }
+
     fn triangles(n: usize) -> [Vec<[Place; 3]>; 4] {
-        let (lists, places) = (lists(n, |_| true), places(n));
+        triangles_of(form(n))
+    }
+
+    fn triangles_of(form: Form) -> [Vec<[Place; 3]>; 4] {
+        let (lists, places) = (lists(form, |_| true), places(form));
         lists.sides.map(|range| {
             lists.indices[range.start as usize..range.end as usize]
                 .chunks(3)
@@ -109,6 +149,34 @@ mod tests {
                 // A quarter of the square of 2n, all in micro-triangles of area 1.
                 assert!(list.iter().all(|t| double_area(*t) == 2));
             }
+        }
+    }
+
+    /// Past the finest lattice the triangles are those of the lattice's last level, in smaller diamonds.
+    #[test]
+    fn cells_without_centres_are_halved_as_the_bintree_halves_them() {
+        for n in [2usize, 4, 64] {
+            let form = Form { segments: n, centres: false };
+            let mut edges = BTreeMap::new();
+            for (side, list) in triangles_of(form).into_iter().enumerate() {
+                assert_eq!(list.len(), n * n / 2, "side {side} of {n}");
+                let m = i64::try_from(n).unwrap();
+                for triangle in list {
+                    assert_eq!(double_area(triangle), 4, "half of a cell, turning left");
+                    // All of it lies between the diagonals that part the side from its neighbours.
+                    for [x, y] in triangle.map(|[p, q]| [p - m, q - m]) {
+                        let turned = [[x, y], [y, -x], [-x, -y], [-y, x]][side];
+                        assert!(turned[1] <= 0 && turned[0].abs() <= -turned[1], "{side} {turned:?}");
+                    }
+                    let [a, b, c] = triangle;
+                    for (from, to) in [(a, b), (b, c), (c, a)] {
+                        assert_eq!(edges.insert((from, to), ()), None, "an edge is walked once each way");
+                    }
+                }
+            }
+            // Neighbouring cells are cut the other way.
+            let rising = |[p, q]: Place| edges.contains_key(&([p, q], [p + 2, q + 2]));
+            assert!(rising([0, 0]) && !rising([2, 0]) && !rising([0, 2]) && (n == 2 || rising([2, 2])));
         }
     }
 
@@ -208,9 +276,9 @@ mod tests {
 
     #[test]
     fn triangles_without_a_point_are_dropped() {
-        let (n, all) = (4, lists(4, |_| true));
+        let (n, all) = (4, lists(form(4), |_| true));
         let hole = Block::slot(n, 1, 1);
-        let some = lists(n, |slot| slot != hole);
+        let some = lists(form(n), |slot| slot != hole);
         assert_eq!(all.indices.len() - some.indices.len(), 4 * 3, "the four triangles of a cell");
         assert!(!some.indices.contains(&u16::try_from(hole).unwrap()));
         assert_eq!(some.sides[3].end as usize, some.indices.len());

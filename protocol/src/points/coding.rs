@@ -113,7 +113,7 @@ impl Coding {
         self.exponents.len() as u32 - 1
     }
 
-    /// The step of most points that a split at `level` adds, in quanta.
+    /// The step of most points that a split at `level` adds or corrects, in quanta.
     #[must_use]
     pub fn level_step(&self, level: u32) -> u32 {
         self.step(self.exponent(level, Place::Off)).cast_unsigned()

@@ -2,10 +2,12 @@
 //!
 //! A diamond's payload holds, in this order,
 //! 1. at level 0 only, the (n+1)^2 points of the root square itself, coarse to fine;
-//! 2. the corrections of the old points strictly inside, wherever this level's step is finer than the
+//! 2. the corrections of the known points strictly inside, wherever this level's step is finer than the
 //!    one that they were last coded with;
 //! 3. which of the n^2 new points have a height, if not all have;
 //! 4. the new points, row by row.
+//!
+//! Levels past the finest lattice have corrections alone.
 //!
 //! Each number is the difference between a height and its prediction from what the receiver already
 //! has, in units of a step. **A point whose difference is zero is fictitious**: nothing is said of it
@@ -17,7 +19,9 @@
 //! **Steps.** Level l uses `fine * 3^e[l]`, fine = 2E+1 quanta, with exponents that fall to 0. A step
 //! three times as fine splits each interval into three equal ones, so a correction costs what was
 //! saved before. The last diamond that has a point strictly inside gives it the fine step: see
-//! `Coding::exponent`. So coarse views do not pay for fine precision, and the finest is as promised.
+//! `Coding::exponent`. So coarse views do not pay for fine precision, and the finest is as promised. Rough
+//! ground needs its finest lattice even for a coarse error: so steps need not be fine there, and the levels
+//! past the lattice refine what is left.
 //!
 //! **Speed.** The class of a number depends on the old points and on the row below, never on its
 //! neighbours in the row: a row's classes are known before its first number, and the two lanes of the
@@ -25,11 +29,14 @@
 //!
 //! | offset | size | field | valid range |
 //! |---|---|---|---|
-//! | 0 | 1 | format, in the high four bits | 2 |
+//! | 0 | 1 | format, in the high four bits | 3 |
 //! | 0 | | bit 0: some new point has no height; bit 1: two lanes; bit 2: every new point is fictitious, and nothing is said of them | |
 //! | 1 | .. | symbols, see [`crate::rans`]; none at all where there is nothing to say | |
 //!
-//! History: format 1 had an adaptive binary coder and a header of 6 bytes.
+//! A payload without bytes says that all is as expected: see [`decode`].
+//!
+//! History: format 1 had an adaptive binary coder and a header of 6 bytes; format 2 had no levels past the
+//! lattice, and where all was as expected a header that said so.
 
 #![allow(
     clippy::cast_possible_truncation,
@@ -41,6 +48,7 @@
 pub mod model;
 
 mod coding;
+mod corrections;
 mod rows;
 mod train;
 mod walk;
@@ -53,10 +61,10 @@ use crate::diamond::{Block, Diamond};
 use crate::rans::{Context, Decoder, Encoder};
 use crate::{HEIGHT_MAX, NODATA};
 use model::{Counts, Tables};
-use walk::walk;
+use walk::{Known, is_inferred, walk, walk_new};
 
 /// The format that this build writes, and the only one that it reads.
-pub const FORMAT: u8 = 2;
+pub const FORMAT: u8 = 3;
 
 /// Bytes before the symbols.
 pub const HEADER_BYTES: usize = 1;
@@ -116,30 +124,38 @@ pub enum DecodeError {
 
 /// Codes the split of `d` and leaves in `block` what a receiver will have.
 ///
-/// `block` holds the reconstructed old points (except at level 0, where they are coded too); `source`
+/// `block` holds the reconstructed points that are known (at level 0 none is: all are coded); `source`
 /// is the whole block of source heights, at most [`SOURCE_MAX`] in magnitude, with [`NODATA`] wherever
-/// the block has none. Returns the payload, and empty bytes where no new point has a height and no old
-/// one is to be corrected: such a diamond has no payload.
+/// the block has none. Returns the payload, and empty bytes where there is nothing to say, since all is as
+/// [`decode`] infers it: such a diamond has no payload.
 #[must_use]
 pub fn encode(forest: &Forest, coding: &Coding, d: Diamond, block: &mut Block, source: &Block) -> Vec<u8> {
-    let root = d.level() == 0;
-    let (old, new) = source.parts();
-    let upper = forest.local(d).upper;
-    let n = forest.segments();
-    let mut valid = (0..n * n).filter(|i| upper || i % n >= i / n).map(|i| new[i] != NODATA);
-    let mut valid_old = old.iter().map(|h| *h != NODATA);
-    if valid.clone().all(|v| !v)
-        && !walk::has_corrections(coding, d.level(), upper, block)
-        && (!root || valid_old.clone().all(|v| !v))
-    {
-        block.parts_mut().1.fill(NODATA);
+    if source.heights().iter().all(|h| *h == NODATA) {
         return Vec::new();
     }
-    let mixed = !valid.all(|v| v) || (root && !valid_old.all(|v| v));
-    let mut sender = Sender { source: source.heights(), coder: Encoder::default(), quiet_from: None };
+    let root = d.level() == 0;
+    let upper = forest.local(d).upper;
+    let n = block.segments();
+    let (mut all_valid, mut as_inferred) = (true, !root);
+    if forest.adds_points(d.level()) {
+        let (old, new) = source.parts();
+        all_valid = !root || !old.contains(&NODATA);
+        for (v, row) in new.chunks_exact(n).enumerate() {
+            for u in if upper { 0 } else { v }..n {
+                all_valid &= row[u] != NODATA;
+                as_inferred &= is_inferred(old, n, upper, u, v) == (row[u] != NODATA);
+            }
+        }
+    }
+    let known = if all_valid { Known::All } else { Known::Sent };
+    let coder = Encoder::default();
+    let mut sender = Sender { source: source.heights(), coder, quiet_from: None, is_silent: as_inferred };
     // A sender's symbols never fail.
-    let _ = walk(forest, coding, d, block, mixed, &mut sender);
-    let mut flags = if mixed { MIXED } else { 0 };
+    let _ = walk(forest, coding, d, block, known, &mut sender);
+    if sender.is_silent {
+        return Vec::new();
+    }
+    let mut flags = if all_valid { 0 } else { MIXED };
     if let Some(from) = sender.quiet_from {
         flags |= QUIET;
         sender.coder.truncate(from);
@@ -156,13 +172,14 @@ pub fn encode(forest: &Forest, coding: &Coding, d: Diamond, block: &mut Block, s
 
 /// Like [`encode`], without the bytes: leaves in `block` what a receiver will have.
 pub fn quantise(forest: &Forest, coding: &Coding, d: Diamond, block: &mut Block, source: &Block) {
-    let _ = walk(forest, coding, d, block, true, &mut Rounder { source: source.heights(), counts: None });
+    let _ = walk(forest, coding, d, block, Known::Sent, &mut Rounder { source: source.heights(), counts: None });
 }
 
-/// Completes `block`, which holds the old points of `d` (none at level 0), from a payload.
+/// Completes `block`, which holds the known points of `d` (none at level 0), from a payload.
 ///
 /// The bytes may be hostile. Takes no memory beyond the block but some hundred kilobytes, and time in
-/// proportion to the block's points. Empty bytes mean that no new point has a height and no old one moves.
+/// proportion to the block's points. Empty bytes mean that a new point has a height where all the corners of
+/// its cell have one, that it is fictitious, and that no known point moves.
 ///
 /// # Errors
 /// When the bytes are no payload of this format; `block` is then of no use.
@@ -177,8 +194,7 @@ pub fn decode(
         return Err(DecodeError::Levels { found: coding.levels(), expected: forest.levels() });
     }
     let Some((header, symbols)) = bytes.split_first() else {
-        block.parts_mut().1.fill(NODATA);
-        return Ok(Tally::default());
+        return infer(forest, coding, d, block);
     };
     let (format, flags) = (header >> 4, header & 15);
     if format != FORMAT {
@@ -190,8 +206,20 @@ pub fn decode(
     let lanes = if flags & TWO_LANES == 0 { 1 } else { 2 };
     let coder = Decoder::new(symbols, lanes).ok_or(DecodeError::Symbols)?;
     let mut receiver = Receiver { coder, quiet: flags & QUIET != 0 };
-    let tally = walk(forest, coding, d, block, flags & MIXED != 0, &mut receiver)?;
+    let known = if flags & MIXED == 0 { Known::All } else { Known::Sent };
+    let tally = walk(forest, coding, d, block, known, &mut receiver)?;
     if receiver.coder.is_spent() { Ok(tally) } else { Err(DecodeError::Symbols) }
+}
+
+/// Completes a block of which nothing is said.
+fn infer(forest: &Forest, coding: &Coding, d: Diamond, block: &mut Block) -> Result<Tally, DecodeError> {
+    if d.level() == 0 {
+        block.parts_mut().0.fill(NODATA);
+        block.parts_mut().1.fill(NODATA);
+    } else if forest.adds_points(d.level()) {
+        return walk_new(coding, d.level(), &forest.local(d), block, Known::Inferred, &mut Silence);
+    }
+    Ok(Tally::default())
 }
 
 /// One pass over a diamond's symbols, whichever way they flow. A single walk serves sender and
@@ -217,6 +245,8 @@ struct Sender<'a> {
     coder: Encoder,
     /// Where the numbers of the new points begin, if all of them turned out to be zero.
     quiet_from: Option<usize>,
+    /// Whether all is as a receiver infers it.
+    is_silent: bool,
 }
 
 struct Rounder<'a> {
@@ -224,6 +254,9 @@ struct Rounder<'a> {
     /// Where to count the numbers that would be sent.
     counts: Option<&'a mut Counts>,
 }
+
+/// A receiver's without a payload.
+struct Silence;
 
 struct Receiver<'a> {
     coder: Decoder<'a>,
@@ -241,6 +274,7 @@ impl Pass for Sender<'_> {
         wanted(self.source[slot])
     }
     fn send(&mut self, tables: &Tables, classes: &[u8], numbers: &[i32]) {
+        self.is_silent &= numbers.iter().all(|k| *k == 0);
         for (lane, (class, number)) in [0, 1].into_iter().cycle().zip(classes.iter().zip(numbers)) {
             tables.encode(&mut self.coder, lane, *class, *number);
         }
@@ -273,6 +307,21 @@ impl Pass for Rounder<'_> {
     }
     fn new_points(&mut self) -> bool {
         false
+    }
+    fn was_quiet(&mut self, _: bool) {}
+}
+
+impl Pass for Silence {
+    fn valid(&mut self, _: &mut Context, _: usize) -> bool {
+        false
+    }
+    fn receive(&mut self, _: &Tables, _: &[u8], _: &mut [i32]) {}
+    fn number(&mut self, _: i32, _: usize, _: impl Fn(i32) -> i32) -> i32 {
+        0
+    }
+    fn send(&mut self, _: &Tables, _: &[u8], _: &[i32]) {}
+    fn new_points(&mut self) -> bool {
+        true
     }
     fn was_quiet(&mut self, _: bool) {}
 }

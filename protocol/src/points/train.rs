@@ -20,7 +20,7 @@ use super::Rounder;
 use super::coding::{Coding, Place, Rule};
 use super::model::{CAUSAL_BITS, Counts, Kernel, Model, PAIRS};
 use super::rows::Ground;
-use super::walk::{walk_new, walk_old, way};
+use super::walk::{Known, walk_new, walk_old, way};
 use crate::NODATA;
 use crate::bintree::Forest;
 use crate::diamond::{Block, Diamond};
@@ -42,29 +42,33 @@ pub fn train<E>(
     mut source: impl FnMut(Diamond) -> Result<Block, E>,
 ) -> Result<Model, E> {
     let levels = forest.levels();
-    let mut kernels = vec![[Kernel::default(); 2]; levels as usize];
+    let mut kernels = vec![[Kernel::default(); 2]; forest.lattice_levels() as usize];
     let mut counts = Counts::default();
     let mut before: BTreeMap<Diamond, Block> = BTreeMap::new();
     for (level, diamonds) in (0..levels).zip(with_ancestors(forest, of)) {
         let mut here = Vec::with_capacity(diamonds.len());
         for d in diamonds {
-            let mut block = Block::empty(forest);
+            let mut block = Block::empty(forest, level);
             for parent in forest.parents(d) {
                 block.inherit(forest, d, parent, &before[&parent]);
             }
             let source = source(d)?;
             let mut pass = Rounder { source: source.heights(), counts: Some(&mut counts) };
             // A sender's heights never fail.
-            let _ = walk_old(coding, level, &forest.local(d), &mut block, true, &mut pass);
+            let _ = walk_old(forest, coding, level, &forest.local(d), &mut block, true, &mut pass);
             here.push((d, block, source));
+        }
+        before.clear();
+        if !forest.adds_points(level) {
+            before.extend(here.into_iter().map(|(d, block, _)| (d, block)));
+            continue;
         }
         let kernels_here = learn(forest, coding, level, &here);
         kernels[level as usize] = kernels_here;
         let learnt = coding.clone().with_model(Model::of_kernels(kernels.clone()));
-        before.clear();
         for (d, mut block, source) in here {
             let mut pass = Rounder { source: source.heights(), counts: Some(&mut counts) };
-            let _ = walk_new(&learnt, level, &forest.local(d), &mut block, true, &mut pass);
+            let _ = walk_new(&learnt, level, &forest.local(d), &mut block, Known::Sent, &mut pass);
             before.insert(d, block);
         }
     }

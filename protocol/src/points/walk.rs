@@ -7,15 +7,15 @@
     reason = "a block has fewer than 2^16 points; numbers are below 2^31 and heights are checked"
 )]
 
-use super::coding::{Coding, Place, Rule, place};
-use super::model::{CAUSAL_BITS, Kernel, ROUGHNESSES, TILTS, class, correction_class};
+use super::coding::{Coding, Place, Rule};
+use super::corrections::walk_corrections;
+use super::model::{CAUSAL_BITS, Kernel, class};
 use super::rows::{Below, Ground, Row, activity, complete};
 use super::{DecodeError, Pass, Tally};
 use crate::bintree::Forest;
 use crate::diamond::{Block, Diamond, Local};
 use crate::rans::Context;
 use crate::{HEIGHT_MAX, NODATA};
-use std::ops::Range;
 
 /// The multiple of `step` nearest to `value`, in steps; `step` is odd, so nothing lies half way.
 pub(super) fn steps(value: i32, step: i32) -> i32 {
@@ -27,7 +27,7 @@ pub(super) fn steps(value: i32, step: i32) -> i32 {
 }
 
 /// `base + k * step`, if that is a height.
-fn moved(base: i32, k: i32, step: i32) -> Result<i32, DecodeError> {
+pub(super) fn moved(base: i32, k: i32, step: i32) -> Result<i32, DecodeError> {
     let height = i64::from(base) + i64::from(k) * i64::from(step);
     i32::try_from(height).ok().filter(|h| h.abs() <= HEIGHT_MAX).ok_or(DecodeError::Height)
 }
@@ -39,22 +39,38 @@ pub(super) fn way(local: &Local) -> usize {
     usize::from(if x == 0 || y == 0 { x == 0 } else { (x > 0) != (y > 0) })
 }
 
+/// Which new points have a height.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Known {
+    /// All.
+    All,
+    /// The payload says it of each.
+    Sent,
+    /// Those all of whose cell's corners have one.
+    Inferred,
+}
+
 pub(super) fn walk<P: Pass>(
     forest: &Forest,
     coding: &Coding,
     d: Diamond,
     block: &mut Block,
-    mixed: bool,
+    known: Known,
     pass: &mut P,
 ) -> Result<Tally, DecodeError> {
     let local = forest.local(d);
-    let old = walk_old(coding, d.level(), &local, block, mixed, pass)?;
-    let new = walk_new(coding, d.level(), &local, block, mixed, pass)?;
+    let old = walk_old(forest, coding, d.level(), &local, block, known == Known::Sent, pass)?;
+    let new = if forest.adds_points(d.level()) {
+        walk_new(coding, d.level(), &local, block, known, pass)?
+    } else {
+        Tally::default()
+    };
     Ok(Tally { real: old.real + new.real, fictitious: old.fictitious + new.fictitious, ..old })
 }
 
 /// All that comes before the new points: the root's own points and the corrections.
 pub(super) fn walk_old<P: Pass>(
+    forest: &Forest,
     coding: &Coding,
     level: u32,
     local: &Local,
@@ -66,7 +82,8 @@ pub(super) fn walk_old<P: Pass>(
     if level == 0 {
         walk_root(coding, block, mixed, pass, &mut tally)?;
     }
-    walk_corrections(coding, level, local.upper, block, pass, &mut tally)?;
+    let turned = !forest.adds_points(level) && block.has_centres();
+    walk_corrections(coding, level, local.upper, turned, block, pass, &mut tally)?;
     Ok(tally)
 }
 
@@ -155,187 +172,6 @@ fn walk_root<P: Pass>(
     Ok(())
 }
 
-/// By how many factors of three the split makes the old points of a place more precise.
-fn depth(coding: &Coding, level: u32, place: Place) -> u8 {
-    coding.exponent_before(level, place).saturating_sub(coding.exponent(level, place))
-}
-
-const PLACES: [Place; 4] = [Place::Off, Place::Hypotenuse, Place::OtherDiagonal, Place::Centre];
-
-/// Whether the split says something of an old point.
-pub(super) fn has_corrections(coding: &Coding, level: u32, upper: bool, block: &Block) -> bool {
-    if PLACES.iter().all(|p| depth(coding, level, *p) == 0) {
-        return false;
-    }
-    let n = block.segments();
-    let (old, _) = block.parts();
-    (1..n).any(|v| {
-        (if upper { 1 } else { v }..n)
-            .any(|u| old[v * (n + 1) + u] != NODATA && depth(coding, level, place(n, 2 * u, 2 * v)) > 0)
-    })
-}
-
-/// Corrections of the old points strictly inside: in each round, coarse to fine, every point whose step is
-/// still too large moves to one of three.
-fn walk_corrections<P: Pass>(
-    coding: &Coding,
-    level: u32,
-    upper: bool,
-    block: &mut Block,
-    pass: &mut P,
-    tally: &mut Tally,
-) -> Result<(), DecodeError> {
-    let n = block.segments();
-    let depths = PLACES.map(|p| depth(coding, level, p));
-    let finest = PLACES.map(|p| coding.exponent(level, p));
-    let rounds = depths.into_iter().max().unwrap_or(0);
-    let (old, _) = block.parts_mut();
-    let holes = rounds > 0 && old.contains(&NODATA);
-    let mut thirds = Thirds::new(n);
-    for round in (1..=rounds).rev() {
-        for v in 1..n {
-            thirds.clear();
-            // Between the diagonals all points are alike; those on them may be of another precision.
-            let (low, high) = (v.min(n - v), v.max(n - v));
-            let first = if upper { 1 } else { v };
-            let between = |thirds: &mut Thirds, from: usize, to: usize| {
-                let (from, to) = (from.max(first), to.min(n));
-                if depths[0] < round || from >= to {
-                    return;
-                }
-                let step = coding.step(finest[0] + round - 1);
-                let slots = v * (n + 1) + from..v * (n + 1) + to;
-                if holes || (!upper && from == v) {
-                    for slot in slots.filter(|s| old[*s] != NODATA) {
-                        thirds.push(old, n, slot, upper || slot % (n + 1) > v, step);
-                    }
-                } else {
-                    thirds.push_all(old, n, slots, step);
-                }
-            };
-            between(&mut thirds, 0, low);
-            for (i, u) in [low, high].into_iter().enumerate().take(if low == high { 1 } else { 2 }) {
-                let at = PLACES.iter().position(|p| *p == place(n, 2 * u, 2 * v)).unwrap_or(0);
-                let slot = v * (n + 1) + u;
-                if (first..n).contains(&u) && depths[at] >= round && old[slot] != NODATA {
-                    thirds.push(old, n, slot, upper || u > v, coding.step(finest[at] + round - 1));
-                }
-                between(&mut thirds, u + 1, if i == 0 && low < high { high } else { n });
-            }
-            thirds.pass(coding, pass, old, tally)?;
-        }
-    }
-    Ok(())
-}
-
-/// A row's worth of corrections by a third, in the order of the row.
-struct Thirds {
-    slots: Vec<usize>,
-    steps: Vec<i32>,
-    /// Whether the neighbours lie lower: towards them counts as up.
-    down: Vec<bool>,
-    classes: Vec<u8>,
-    numbers: Vec<i32>,
-}
-
-/// The class of a correction by `1 / per_step` of a point with these neighbours to the west, east, south
-/// and north; and whether they lie lower.
-#[inline(always)]
-fn third(here: i32, [w, e, s, n]: [i32; 4], per_step: f32) -> (u8, bool) {
-    // How far the neighbours' mean lies to one side, in parts of the three steps to choose from.
-    const TILT: [f32; TILTS - 1] = [0.06, 0.18, 0.35, 0.6, 1.2];
-    const ROUGH: [f32; ROUGHNESSES - 1] = [6.0, 18.0];
-    let tilt = w + e + s + n - 4 * here;
-    let aside = tilt.abs() as f32 * (per_step * (1.0 / 12.0));
-    let bends = (2 * (w + e - s - n).abs() + (w - e).abs() + (s - n).abs()) as f32 * (per_step * 0.25);
-    let tilted: u8 = TILT.iter().map(|limit| u8::from(aside >= *limit)).sum();
-    let rough: u8 = ROUGH.iter().map(|limit| u8::from(bends >= *limit)).sum();
-    (correction_class(tilted, rough), tilt < 0)
-}
-
-impl Thirds {
-    fn new(n: usize) -> Self {
-        let room = n + 1;
-        Self {
-            slots: Vec::with_capacity(room),
-            steps: Vec::with_capacity(room),
-            down: Vec::with_capacity(room),
-            classes: Vec::with_capacity(room),
-            numbers: Vec::with_capacity(room),
-        }
-    }
-
-    fn clear(&mut self) {
-        self.slots.clear();
-        self.steps.clear();
-        self.down.clear();
-        self.classes.clear();
-    }
-
-    /// Adds the old point at `slot`, to be moved by a `step` or not at all. `beside`: whether there are
-    /// points to the west and to the north of it.
-    fn push(&mut self, old: &[i32], n: usize, slot: usize, beside: bool, step: i32) {
-        let here = old[slot];
-        let known = |exists: bool, slot: usize| match old.get(slot) {
-            Some(h) if exists && *h != NODATA => *h,
-            _ => here,
-        };
-        let near = [
-            known(beside, slot - 1),
-            known(true, slot + 1),
-            known(true, slot - n - 1),
-            known(beside, slot + n + 1),
-        ];
-        let (class, down) = third(here, near, 1.0 / step as f32);
-        self.slots.push(slot);
-        self.steps.push(step);
-        self.classes.push(class);
-        self.down.push(down);
-    }
-
-    /// Adds a run of old points whose neighbours all have heights.
-    fn push_all(&mut self, old: &[i32], n: usize, slots: Range<usize>, step: i32) {
-        let (from, count) = (slots.start, slots.len());
-        let per_step = 1.0 / step as f32;
-        let line = |at: usize| &old[at..at + count];
-        let (here, w, e) = (line(from), line(from - 1), line(from + 1));
-        let (s, north) = (line(from - n - 1), line(from + n + 1));
-        let start = self.classes.len();
-        self.slots.extend(slots);
-        self.steps.resize(start + count, step);
-        self.classes.resize(start + count, 0);
-        self.down.resize(start + count, false);
-        let (classes, down) = (&mut self.classes[start..][..count], &mut self.down[start..][..count]);
-        for u in 0..count {
-            (classes[u], down[u]) = third(here[u], [w[u], e[u], s[u], north[u]], per_step);
-        }
-    }
-
-    fn pass<P: Pass>(
-        &mut self,
-        coding: &Coding,
-        pass: &mut P,
-        old: &mut [i32],
-        tally: &mut Tally,
-    ) -> Result<(), DecodeError> {
-        let tables = coding.model().tables();
-        self.numbers.clear();
-        self.numbers.resize(self.slots.len(), 0);
-        pass.receive(tables, &self.classes, &mut self.numbers);
-        let places = self.slots.iter().zip(&self.steps).zip(&self.down);
-        for (((slot, step), down), number) in places.zip(&mut self.numbers) {
-            let base = old[*slot];
-            let turn = |k: i32| if *down { -k } else { k };
-            *number = pass.number(*number, *slot, |h| turn(steps(h - base, *step).clamp(-1, 1)));
-            // Where numbers are damaged they are still small: tables of corrections have three symbols.
-            old[*slot] = moved(base, turn(*number), *step)?;
-            tally.corrected += u32::from(*number != 0);
-        }
-        pass.send(tables, &self.classes, &self.numbers);
-        Ok(())
-    }
-}
-
 /// Which new points have a height: into `new`, 0 for those that have.
 fn walk_validity<P: Pass>(old: &[i32], new: &mut [i32], n: usize, upper: bool, pass: &mut P) {
     let mut contexts: [Context; 20] = std::array::from_fn(|i| {
@@ -345,11 +181,7 @@ fn walk_validity<P: Pass>(old: &[i32], new: &mut [i32], n: usize, upper: bool, p
     for v in 0..n {
         let first = if upper { 0 } else { v };
         for u in first..n {
-            let at = v * (n + 1) + u;
-            let corners = [at, at + 1, at + n + 2, at + n + 1];
-            // The diagonal's last corner lies beyond a diamond at the border.
-            let corners = &corners[..if !upper && u == v { 3 } else { 4 }];
-            let valid = corners.iter().filter(|s| old[**s] != NODATA).count();
+            let valid = corners(n, upper, u, v).iter().filter(|s| old[**s] != NODATA).count();
             let west = u > first && new[v * n + u - 1] != NODATA;
             let south = v > 0 && new[(v - 1) * n + u] != NODATA;
             let context = valid * 4 + usize::from(west) * 2 + usize::from(south);
@@ -359,22 +191,43 @@ fn walk_validity<P: Pass>(old: &[i32], new: &mut [i32], n: usize, upper: bool, p
     }
 }
 
+/// The slots of the corners of a cell, as far as they exist: the fourth one lies beyond the diagonal of a
+/// diamond at the forest's border, and is then the first one again.
+fn corners(n: usize, upper: bool, u: usize, v: usize) -> [usize; 4] {
+    let at = v * (n + 1) + u;
+    [at, at + 1, at + n + 2, if !upper && u == v { at } else { at + n + 1 }]
+}
+
+/// Whether the new point of a cell has a height, as long as nothing else is said.
+pub(super) fn is_inferred(old: &[i32], n: usize, upper: bool, u: usize, v: usize) -> bool {
+    corners(n, upper, u, v).iter().all(|s| old[*s] != NODATA)
+}
+
 /// The new points, row by row.
 pub(super) fn walk_new<P: Pass>(
     coding: &Coding,
     level: u32,
     local: &Local,
     block: &mut Block,
-    mixed: bool,
+    known: Known,
     pass: &mut P,
 ) -> Result<Tally, DecodeError> {
     let mut tally = Tally::default();
     let n = block.segments();
     let (old, new) = block.parts_mut();
     new.fill(NODATA);
-    if mixed {
-        walk_validity(old, new, n, local.upper, pass);
+    match known {
+        Known::All => {}
+        Known::Sent => walk_validity(old, new, n, local.upper, pass),
+        Known::Inferred => {
+            for (v, row) in new.chunks_exact_mut(n).enumerate() {
+                for u in if local.upper { 0 } else { v }..n {
+                    row[u] = if is_inferred(old, n, local.upper, u, v) { 0 } else { NODATA };
+                }
+            }
+        }
     }
+    let mixed = known != Known::All;
     let quiet = pass.new_points();
     let mut rows = NewRows::new(coding, level, local, old, n);
     let mut all_zero = true;

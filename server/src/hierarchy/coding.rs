@@ -34,16 +34,24 @@ pub(super) fn fine_step(max_error: f64, stats: &Stats) -> Result<u32, BuildError
 /// less than 0.1 %; with 8 a store is 1 % larger, where steps are large 7 %.
 const MODEL_SAMPLES: usize = 24;
 
-/// How the layer is coded: its steps, and a model learnt from a spread of its diamonds.
-pub(super) fn coding(plan: &Plan, canvas: &Canvas, rule: Rule, fine_step: u32) -> Result<Coding, BuildError> {
+/// How the layer is coded: its steps, and a model learnt from a spread of its diamonds; and the plan with as
+/// many levels past the finest lattice as these steps ask for.
+pub(super) fn coding(
+    plan: &Plan,
+    canvas: &Canvas,
+    rule: Rule,
+    fine_step: u32,
+) -> Result<(Plan, Coding), BuildError> {
     let work = |error: io::Error| BuildError::Work { path: canvas.folder().to_owned(), error };
-    let coding = Coding::new(rule, fine_step, exponents(plan, canvas, fine_step).map_err(work)?)?;
+    let (exponents, precision) = exponents(plan, canvas, fine_step).map_err(work)?;
+    let plan = &plan.with_precision(precision);
+    let coding = Coding::new(rule, fine_step, exponents)?;
     let forest = &plan.forest;
     // Coarse levels are all read from one window, finer ones each from its own.
     let chunk_level = plan.chunks.level();
     let coarse = canvas.read(plan.spacing_log2(chunk_level), [0, 0], forest.size()).map_err(work)?;
     let source = |d: Diamond| -> io::Result<Block> {
-        let mut block = Block::empty(forest);
+        let mut block = Block::empty(forest, d.level());
         let local = forest.local(d);
         if d.level() < chunk_level {
             block.fill(&local, |x, y| coarse.at(x, y));
@@ -68,7 +76,7 @@ pub(super) fn coding(plan: &Plan, canvas: &Canvas, rule: Rule, fine_step: u32) -
         samples.extend(fullest.map(|(_, d)| d));
     }
     let model = points::train(forest, &coding, &samples, source).map_err(work)?;
-    Ok(coding.with_model(model))
+    Ok((*plan, coding.with_model(model)))
 }
 
 /// Up to `count` of a list, evenly spread over it.
@@ -77,25 +85,46 @@ fn spread(list: &[Diamond], count: usize) -> Vec<Diamond> {
     (0..count).map(|i| list[i * list.len() / count]).collect()
 }
 
-/// A step for each level: about what the next finer level would add anyway, so that coarse views do not
-/// pay for a precision that they cannot show.
-fn exponents(plan: &Plan, canvas: &Canvas, fine_step: u32) -> io::Result<Vec<u8>> {
-    let forest = &plan.forest;
-    let details: Vec<f64> =
-        (0..forest.levels()).map(|level| detail(plan, canvas, level)).collect::<io::Result<_>>()?;
-    let mut exponents = vec![0u8; forest.levels() as usize + 1];
-    // exponents[i + 1] is level i's; a level's step follows the detail of the level after it.
-    for i in (0..forest.levels() as usize).rev() {
-        let target = details.get(i).copied().unwrap_or(0.0);
-        let mut exponent = exponents[i + 1];
-        while (f64::from(fine_step) * 3f64.powi(i32::from(exponent) + 1)) <= target
+/// How many times the root mean square of what the next level adds a level's step is: some eight times that is
+/// the largest that it adds anywhere in a diamond, and so the error at which the level is used.
+const STEP_TO_DETAIL: f64 = 4.0;
+
+/// A step for each level, so that views do not pay for a precision that they cannot show, and how many levels
+/// past the finest lattice make up for it.
+///
+/// A level's step follows what the level after it would add. Past the lattice nothing is added; the first step
+/// there follows what would be, if the source went on as it did.
+fn exponents(plan: &Plan, canvas: &Canvas, fine_step: u32) -> io::Result<(Vec<u8>, u8)> {
+    let lattice = plan.forest.lattice_levels() as usize;
+    let mut details: Vec<f64> =
+        (0..lattice as u32).map(|level| detail(plan, canvas, level)).collect::<io::Result<_>>()?;
+    details.push(next_detail(&details));
+    let c = std::env::var("DIAMANTINA_C").ok().and_then(|v| v.parse().ok()).unwrap_or(STEP_TO_DETAIL);
+    let mut exponents = vec![0u8; lattice + 1];
+    // exponents[i + 1] is level i's.
+    for i in (0..=lattice).rev() {
+        let mut exponent = exponents.get(i + 1).copied().unwrap_or(0);
+        while (f64::from(fine_step) * 3f64.powi(i32::from(exponent) + 1)) <= c * details[i]
             && fine_step.saturating_mul(3u32.pow(u32::from(exponent) + 1)) < STEP_MAX / 4
         {
             exponent += 1;
         }
         exponents[i] = exponent;
     }
-    Ok(exponents)
+    // The levels past the lattice share what is left.
+    let left = exponents[lattice];
+    let precision = left.min(plan.precision_max());
+    exponents.extend((0..precision).rev().map(|rest| left * rest / precision));
+    Ok((exponents, precision))
+}
+
+/// What the level after the last would add: the trend of the last three, which are of both parities.
+fn next_detail(details: &[f64]) -> f64 {
+    let ratio = match details {
+        [.., first, _, last] if *first > 0.0 => (last / first).sqrt().clamp(0.25, 1.0),
+        _ => 1.0,
+    };
+    details.last().map_or(0.0, |last| last * ratio)
 }
 
 /// The root mean square, in quanta, of what a level's new points differ from the mean of the four around

@@ -2,8 +2,8 @@
 //!
 //! The source is cut into tiles of 4 x 4 patches. Some are read, to know how much of it has heights; some of
 //! those are built as if each were a source of its own, by the same code, in a temporary folder. Of their four
-//! levels the finer three, which add 7 of 8 points, are taken as they are; what the coarser ones cost
-//! follows from how the cost falls from level to level.
+//! levels the finer three, which add 7 of 8 points, are taken as they are, and so are those past the lattice;
+//! what the coarser ones cost follows from how the cost falls from level to level.
 
 #![allow(
     clippy::cast_possible_truncation,
@@ -115,16 +115,20 @@ pub fn estimate(source: &Source, options: &Options) -> Result<Estimate, BuildErr
     tiles.retain(|tile| tile.stats.valid > 0);
     let tiles = spread(tiles, BUILT_MAX / tile_samples);
     let (built, built_valid) = sum(&tiles);
-    let each: Vec<(Levels, Duration)> =
+    let each: Vec<Built> =
         tiles.par_iter().map(|tile| build_tile(tile, grid, options)).collect::<Result<_, BuildError>>()?;
-    let mut levels = Levels::default();
-    for (level, sum) in levels.iter_mut().enumerate() {
-        *sum = each.iter().map(|(levels, _)| levels[level]).sum();
+    let mut all = Built::default();
+    for built in each {
+        all.levels.iter_mut().zip(built.levels).for_each(|(sum, bytes)| *sum += bytes);
+        all.past_bytes += built.past_bytes;
+        all.past_diamonds += built.past_diamonds;
+        all.took += built.took;
     }
-    let bytes = of_all_levels(levels, built_valid);
+    let bytes = of_all_levels(all.levels, built_valid) + all.past_bytes;
     let workers = rayon::current_num_threads().min(plan.workers);
-    let building = each.iter().map(|(_, took)| *took).sum::<Duration>() / workers as u32;
+    let building = all.took / workers as u32;
     let per = |part: f64, of: u64| if of == 0 { 0.0 } else { part / of as f64 };
+    let diamonds = diamonds + (per(all.past_diamonds, built_valid) * valid_samples as f64).round() as u64;
     let point_bytes = (per(bytes, built_valid) * valid_samples as f64).round() as u64;
     let seconds = FIXED_SECONDS
         + samples as f64 * per(reading.as_secs_f64(), read)
@@ -201,7 +205,7 @@ fn diamonds(forest: &Forest, grid: &Grid, tiles: &[Tile], tile_side: u32) -> u64
     let coarse = share(&tiles.iter().map(|tile| tile.stats.valid > 0).collect::<Vec<_>>());
     let [w, h] = [grid.width, grid.height].map(|n| u64::from(n.saturating_sub(1).max(1)));
     let mut sum = 0.0;
-    for level in (0..forest.levels()).step_by(2) {
+    for level in (0..forest.lattice_levels()).step_by(2) {
         let side = 1u64 << (forest.root_log2() - level / 2);
         // Squares; and sides of squares, which need not be all in the source for their diamonds to touch it.
         let squares = |n: u64| n.div_ceil(side);
@@ -231,8 +235,19 @@ fn of_all_levels([_, one, two, three]: Levels, samples: u64) -> f64 {
     three + two + one + coarser.sum::<f64>()
 }
 
-/// Builds a tile in a temporary folder; the bytes of its payloads, and how long coding and comparing took.
-fn build_tile(tile: &Tile, grid: &Grid, options: &Options) -> Result<(Levels, Duration), BuildError> {
+/// What building a tile gave.
+#[derive(Debug, Clone, Copy, Default)]
+struct Built {
+    levels: Levels,
+    /// Bytes of the levels past the lattice, and the diamonds that have them.
+    past_bytes: f64,
+    past_diamonds: f64,
+    /// How long coding and comparing took.
+    took: Duration,
+}
+
+/// Builds a tile in a temporary folder.
+fn build_tile(tile: &Tile, grid: &Grid, options: &Options) -> Result<Built, BuildError> {
     let temporary = |error| BuildError::Work { path: std::env::temp_dir(), error };
     let folder = tempfile::tempdir().map_err(temporary)?;
     let writer = Writer::create(folder.path())?;
@@ -245,7 +260,8 @@ fn build_tile(tile: &Tile, grid: &Grid, options: &Options) -> Result<(Levels, Du
     let canvas = Canvas::create(writer.work_folder(), width, height, plan.coarsest()).map_err(&failed)?;
     canvas.write_rows(0, &tile.heights).map_err(&failed)?;
     let fine_step = fine_step(options.max_error, &tile.stats)?;
-    let coding = coding(&plan, &canvas, options.rule, fine_step)?;
+    let (plan, coding) = coding(&plan, &canvas, options.rule, fine_step)?;
+    let forest = plan.forest;
     let progress = Progress::hidden();
     let journal = Journal::create(writer.work_folder(), &[0; 32], Duration::MAX).map_err(&failed)?;
     let work = Work { writer: &writer, journal, progress: &progress, chunks: 1 };
@@ -272,11 +288,17 @@ fn build_tile(tile: &Tile, grid: &Grid, options: &Options) -> Result<(Levels, Du
         let half = x == 0 || y == 0 || x == w || y == h;
         bytes - if half { bytes.min(FIXED_BYTES) / 2.0 } else { 0.0 }
     };
-    let mut levels = Levels::default();
-    for (level, sum) in (0..forest.levels()).zip(&mut levels) {
+    let mut built = Built { took, ..Built::default() };
+    for (level, sum) in (0..forest.lattice_levels()).zip(&mut built.levels) {
         *sum = forest.diamonds(level).map(bytes).sum();
     }
-    Ok((levels, took))
+    for d in (forest.lattice_levels()..forest.levels()).flat_map(|level| forest.diamonds(level)) {
+        built.past_bytes += bytes(d);
+        let [x, y] = d.centre();
+        let share = if x == 0 || y == 0 || x == w || y == h { 0.5 } else { 1.0 };
+        built.past_diamonds += if tallies.of.get(d).bytes > 0 { share } else { 0.0 };
+    }
+    Ok(built)
 }
 
 #[cfg(test)]

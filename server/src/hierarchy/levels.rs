@@ -74,7 +74,7 @@ impl Build<'_> {
                     }
                     let mut block = inherited(forest, &before, d);
                     // The plane is finer than most of these levels.
-                    let mut source = Block::empty(forest);
+                    let mut source = Block::empty(forest, level);
                     source.fill(&forest.local(d), |x, y| window.at(x, y));
                     let coded = self.code(d, &mut block, &source)?;
                     Ok((d, block, coded))
@@ -166,33 +166,34 @@ impl Build<'_> {
         }
         let mut before: HashMap<Diamond, Block> = HashMap::new();
         for (level, diamonds) in (own..).zip(&self.plan.chunks.needed(corner)) {
-            let mut surface = Surface::new(self.plan.spacing_log2(level + 1), corner, cells);
-            before = self.chunk_level(level, diamonds, &before, &mut surface, coarse, &mut chunk)?;
-            if samples.is_empty() {
-                continue;
-            }
-            if level + 1 < forest.levels() {
+            // What the last level of the lattice draws, and those past it, is at the samples' own places: there
+            // the diamonds compare themselves.
+            let draws = level + 1 < forest.lattice_levels();
+            let mut surface =
+                draws.then(|| Surface::new(self.plan.spacing_log2(level + 1), corner, cells));
+            before = self.chunk_level(corner, level, diamonds, &before, surface.as_mut(), coarse, &mut chunk)?;
+            if let Some(surface) = surface.filter(|_| !samples.is_empty()) {
                 measure(forest, level + 1, &samples, surface.nodes(), &mut found);
-            } else {
-                chunk.finest = finest(&surface, window.heights());
             }
         }
-        chunk.found = found.into_iter().map(|(d, here): (_, Found)| (d.centre(), here)).collect();
+        chunk.found.extend(found.into_iter().map(|(d, here): (_, Found)| (d.centre(), here)));
         Ok(chunk)
     }
 
-    /// Codes the diamonds of one level of a chunk, those that it owns for good, and draws all. Their blocks.
+    /// Codes the diamonds of one level of a chunk, those that it owns for good, and draws all, if there is
+    /// something to draw to. Their blocks.
     fn chunk_level(
         &self,
+        corner: [u32; 2],
         level: u32,
         diamonds: &BTreeSet<Diamond>,
         before: &HashMap<Diamond, Block>,
-        surface: &mut Surface,
+        mut surface: Option<&mut Surface>,
         coarse: &Coarse,
         chunk: &mut Chunk,
     ) -> Result<HashMap<Diamond, Block>, BuildError> {
         let forest = &self.plan.forest;
-        let (side, corner) = (1u32 << self.plan.chunks.side_log2(), surface.origin());
+        let side = 1u32 << self.plan.chunks.side_log2();
         let mut here = HashMap::with_capacity(diamonds.len());
         let Some([low, high]) = bounds(forest, diamonds) else { return Ok(here) };
         let spacing = self.plan.spacing_log2(level + 1);
@@ -207,11 +208,20 @@ impl Build<'_> {
             }
             let source = source_block(forest, *d, &window);
             if self.plan.chunks.owns(corner, *d) {
+                if !forest.adds_points(level) {
+                    let vertical = distance(&block, &source);
+                    chunk.found.push((d.centre(), Found { vertical, outline: false }));
+                }
                 chunk.coded.push(self.code(*d, &mut block, &source)?);
+                if level + 1 == forest.levels() {
+                    chunk.finest = chunk.finest.max(distance(&block, &source));
+                }
             } else {
                 points::quantise(forest, &self.coding, *d, &mut block, &source);
             }
-            surface.draw(forest, *d, &block, [side, side]);
+            if let Some(surface) = &mut surface {
+                surface.draw(forest, *d, &block, [side, side]);
+            }
             here.insert(*d, block);
         }
         Ok(here)
@@ -221,7 +231,7 @@ impl Build<'_> {
 /// The old points of a diamond of the chunks' own level, which starts from what the coarse levels left.
 fn take_over(forest: &Forest, d: Diamond, coarse: &Coarse, block: &mut Block) {
     let Some(last) = coarse.surfaces.last() else { return };
-    let mut whole = Block::empty(forest);
+    let mut whole = Block::empty(forest, d.level());
     whole.fill(&forest.local(d), |x, y| {
         let on_lattice = (x | y).trailing_zeros() >= last.spacing_log2;
         if on_lattice { last.at(x, y) } else { NODATA }
@@ -229,15 +239,15 @@ fn take_over(forest: &Forest, d: Diamond, coarse: &Coarse, block: &mut Block) {
     block.parts_mut().0.copy_from_slice(whole.parts().0);
 }
 
-/// The largest distance between the finest level and the samples, in quanta.
-fn finest(surface: &Surface, heights: &[i32]) -> f64 {
-    let both = surface.heights.iter().zip(heights).filter(|(_, sample)| **sample != NODATA);
+/// The largest distance between what a diamond has and its samples, in quanta.
+fn distance(block: &Block, source: &Block) -> f64 {
+    let both = block.heights().iter().zip(source.heights()).filter(|(_, sample)| **sample != NODATA);
     both.map(|(drawn, sample)| drawn.abs_diff(*sample)).max().unwrap_or(0).into()
 }
 
 /// The block of a diamond with the old points that its parents leave.
 fn inherited(forest: &Forest, before: &HashMap<Diamond, Block>, d: Diamond) -> Block {
-    let mut block = Block::empty(forest);
+    let mut block = Block::empty(forest, d.level());
     for parent in forest.parents(d) {
         if let Some(from) = before.get(&parent) {
             block.inherit(forest, d, parent, from);

@@ -155,7 +155,7 @@ fn run(
     let (work, canvas, before) = work::open(writer, &plan, grid, &fingerprint, options, progress)?;
     let stats = transcribe(source, &plan, &canvas, quantum, &before.bands, &work)?;
     let fine_step = fine_step(options.max_error, &stats)?;
-    let coding = coding::coding(&plan, &canvas, options.rule, fine_step)?;
+    let (plan, coding) = coding::coding(&plan, &canvas, options.rule, fine_step)?;
     let build = Build {
         plan,
         canvas,

@@ -8,6 +8,8 @@
 //! | a chunk, for each worker: windows 9, surface 4, blocks of two levels 8, a third for the allocator | 28 a cell | coding |
 //! | a diamond's tally, place in the spool, entry, place in a pack, line of the directory | 136 | coding, then publishing |
 
+#![allow(clippy::cast_possible_truncation, reason = "levels are fewer than 64")]
+
 use super::BuildError;
 use super::tallies::places_of_all;
 use crate::chunks::Chunks;
@@ -21,6 +23,13 @@ const COARSE_POINT_BYTES: u64 = 40;
 const CHUNK_CELL_BYTES: u64 = 28;
 /// 24 (tally) + 16 (entry) + 40 (spool) + 40 (pack) + 32 (directory), less what is given back in between.
 const DIAMOND_BYTES: u64 = 136;
+
+/// The most levels past the finest lattice. More would have very small diamonds; where they are too few, each
+/// makes steps finer by more than one factor of three.
+const PRECISION_MAX: u8 = 3;
+/// Diamonds beyond which there are fewer such levels, so that the index does not outgrow the memory: sources of
+/// 4 x 10^9 samples and more, with 64 segments.
+const PLACES_MAX: u64 = 1 << 23;
 
 /// How the forest is divided for the build.
 #[derive(Debug, Clone, Copy)]
@@ -37,7 +46,9 @@ pub(super) struct Plan {
 }
 
 impl Plan {
+    /// For a forest that may yet get levels past its finest lattice: there is room for as many as there can be.
     pub(super) fn new(forest: Forest, memory: u64) -> Result<Self, BuildError> {
+        let forest = widest(forest);
         let [w, h] = forest.size().map(u64::from);
         let threads = rayon::current_num_threads() as u64;
         // Chunks of 1024 cells, or larger where the coarse levels would otherwise not fit.
@@ -70,9 +81,21 @@ impl Plan {
         })
     }
 
+    /// The most levels past the finest lattice that there is room for.
+    pub(super) fn precision_max(&self) -> u8 {
+        (self.forest.levels() - self.forest.lattice_levels()) as u8
+    }
+
+    /// The same plan with as many levels past the finest lattice, if there is room for them.
+    pub(super) fn with_precision(&self, levels: u8) -> Self {
+        let forest = self.forest.with_precision(levels.min(self.precision_max())).unwrap_or(self.forest);
+        Self { forest, chunks: Chunks::new(forest, self.chunks.side_log2()), ..*self }
+    }
+
     /// Base-2 logarithm of the spacing of the lattice of a level: that of the canvas plane with all its
     /// points. Of an odd level half of the plane's points are its own.
     pub(super) fn spacing_log2(&self, level: u32) -> u32 {
+        let level = level.min(self.forest.lattice_levels());
         self.forest.root_log2() - self.forest.patch_log2() - level.div_ceil(2)
     }
 
@@ -80,6 +103,13 @@ impl Plan {
     pub(super) fn coarsest(&self) -> u32 {
         self.spacing_log2(self.chunks.level())
     }
+}
+
+/// The forest with as many levels past its finest lattice as a build makes at most.
+fn widest(forest: Forest) -> Forest {
+    let fits = |forest: &Forest| places_of_all(forest) <= PLACES_MAX;
+    let all = (1..=PRECISION_MAX).filter_map(|levels| forest.with_precision(levels).ok());
+    all.take_while(fits).last().unwrap_or(forest)
 }
 
 #[cfg(test)]

@@ -52,7 +52,7 @@ impl Walk {
 /// The source heights of a diamond's block; the window holds all of the diamond, at the spacing of the level
 /// that it splits into.
 pub(super) fn source_block(forest: &Forest, d: Diamond, window: &Window) -> Block {
-    let mut block = Block::empty(forest);
+    let mut block = Block::empty(forest, d.level());
     let local = forest.local(d);
     let walk = Walk::new(&local, window.spacing_log2(), window.origin(), window.width());
     let n = block.segments();
@@ -74,11 +74,6 @@ impl Surface {
     pub(super) fn new(spacing_log2: u32, origin: [u32; 2], cells: [u32; 2]) -> Self {
         let [w, h] = cells.map(|c| (c >> spacing_log2) as usize + 1);
         Self { spacing_log2, origin, width: w, heights: vec![NODATA; w * h] }
-    }
-
-    /// Lattice coordinates of the south-west corner.
-    pub(super) fn origin(&self) -> [u32; 2] {
-        self.origin
     }
 
     pub(super) fn at(&self, x: u32, y: u32) -> i32 {
@@ -161,7 +156,7 @@ mod tests {
                 let [low, high] = forest.bounds(d);
                 let window = canvas.read(spacing, low, high).unwrap();
                 let block = source_block(&forest, d, &window);
-                let mut expected = Block::empty(&forest);
+                let mut expected = Block::empty(&forest, level);
                 let local = forest.local(d);
                 expected.fill(&local, height);
                 assert_eq!(block, expected, "{d:?}");

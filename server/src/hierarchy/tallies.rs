@@ -40,26 +40,30 @@ impl From<&Coded> for Tally {
 #[derive(Debug)]
 pub(super) struct PerDiamond<T> {
     forest: Forest,
+    value: T,
+    /// Empty where all have the first value.
     levels: Vec<Vec<T>>,
 }
 
 impl<T: Copy> PerDiamond<T> {
     /// The same value for all.
     pub(super) fn new(forest: Forest, value: T) -> Self {
-        let levels = (0..forest.levels())
-            .map(|level| vec![value; usize::try_from(places(&forest, level)).unwrap_or(usize::MAX)])
-            .collect();
-        Self { forest, levels }
+        let levels = (0..forest.levels()).map(|_| Vec::new()).collect();
+        Self { forest, value, levels }
     }
 
     /// The value of a diamond of this forest.
     pub(super) fn at(&mut self, d: Diamond) -> &mut T {
-        &mut self.levels[d.level() as usize][place(&self.forest, d)]
+        let level = &mut self.levels[d.level() as usize];
+        if level.is_empty() {
+            level.resize(usize::try_from(places(&self.forest, d.level())).unwrap_or(usize::MAX), self.value);
+        }
+        &mut level[place(&self.forest, d)]
     }
 
     /// The value of a diamond of this forest.
     pub(super) fn get(&self, d: Diamond) -> T {
-        self.levels[d.level() as usize][place(&self.forest, d)]
+        self.levels[d.level() as usize].get(place(&self.forest, d)).copied().unwrap_or(self.value)
     }
 
     /// All values, in no order; of a few places there is no diamond.
@@ -116,8 +120,8 @@ impl Tallies {
 
     /// Takes them away from where the workers collect.
     pub(super) fn take(&mut self) -> Self {
-        let levels = std::mem::take(&mut self.of.levels);
-        Self { of: PerDiamond { forest: self.of.forest, levels }, finest: self.finest }
+        let PerDiamond { forest, value, ref mut levels } = self.of;
+        Self { of: PerDiamond { forest, value, levels: std::mem::take(levels) }, finest: self.finest }
     }
 
     /// Notes what coding a diamond gave.
@@ -163,7 +167,7 @@ mod tests {
     #[test]
     fn every_diamond_has_a_place_of_its_own() {
         for (root, roots) in [(6, [1, 1]), (5, [3, 2]), (4, [1, 5])] {
-            let forest = Forest::new(root, 2, roots).unwrap();
+            let forest = Forest::new(root, 2, roots).unwrap().with_precision(3).unwrap();
             for level in 0..forest.levels() {
                 let taken: BTreeSet<usize> = forest.diamonds(level).map(|d| place(&forest, d)).collect();
                 assert_eq!(taken.len(), forest.diamonds(level).count(), "{forest:?} level {level}");
