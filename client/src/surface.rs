@@ -67,9 +67,8 @@ impl Surface {
         let [e, f]: [[i64; 2]; 2] =
             if self.block.has_centres() { [[1, 1], [1, -1]] } else { [[2, 0], [0, 2]] };
         // Metres of a unit along an axis.
-        let metres = |[p, q]: [i64; 2]| {
-            [0, 1].map(|i| (local.u[i] * p + local.v[i] * q) as f64 * layer.cell[i] / 2.0)
-        };
+        let metres =
+            |[p, q]: [i64; 2]| [0, 1].map(|i| (local.u[i] * p + local.v[i] * q) as f64 * layer.cell[i] / 2.0);
         let (along, across) = (metres(e), metres(f));
         let det = along[0] * across[1] - along[1] * across[0];
         let height = |p: i64, q: i64| -> Option<f64> {

@@ -423,12 +423,7 @@ impl Renderer {
         self.queue.write_buffer(buffer, 0, bytes);
     }
 
-    fn draw_terrain(
-        &self,
-        pass: &mut wgpu::RenderPass<'_>,
-        draws: &[Draw<'_>],
-        stats: &mut FrameStats,
-    ) {
+    fn draw_terrain(&self, pass: &mut wgpu::RenderPass<'_>, draws: &[Draw<'_>], stats: &mut FrameStats) {
         let (Some((_, layer_group)), Some(instances)) = (&self.layers, &self.instances) else { return };
         pass.set_pipeline(&self.terrain);
         pass.set_bind_group(0, &self.frame_group, &[]);

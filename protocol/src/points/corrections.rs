@@ -1,7 +1,19 @@
 //! Corrections: points strictly inside a diamond move, where its split has a finer step than they have.
 //!
 //! A step three times as fine splits each interval into three equal ones, so a correction is one of three
-//! symbols: stay, or move to either side. How likely each is depends on where the neighbours lie.
+//! symbols: stay, or move to either side. How likely each is depends on where the neighbours lie: a weighted
+//! sum of what they differ says where the point is expected, and of how they differ among themselves how far
+//! off that may be. The weights are learnt, by level and pass.
+//!
+//! **Passes.** Coarse to fine, like the lattice, so that most points have neighbours on all sides that are
+//! corrected already:
+//!
+//! ```text
+//!   c b c b c      a  those in even rows and columns
+//!   a c a c a      b  those in odd rows and columns, between four corrected ones across corners
+//!   c b c b c      c  all others, between four corrected ones
+//!   a c a c a
+//! ```
 //!
 //! Rows run along the local grid. Past the finest lattice the grid of an odd level is turned, so that its rows
 //! run along the lattice and a point's neighbours are the nearest there are:
@@ -21,14 +33,35 @@
 )]
 
 use super::coding::{Coding, Place};
-use super::model::{ROUGHNESSES, TILTS, correction_class};
-use super::walk::{moved, steps};
+use super::model::{FIRST_CORRECTION, REFINER_PASSES, Refiner, SPREAD_PARTS, SPREADS, TILT_PARTS, TILTS};
+use super::walk::{HEIGHT_BITS, steps};
 use super::{DecodeError, Pass, Tally};
 use crate::NODATA;
 use crate::diamond::Block;
-use std::ops::Range;
 
 const PLACES: [Place; 4] = [Place::Off, Place::Hypotenuse, Place::OtherDiagonal, Place::Centre];
+
+/// The passes over a grid, in their order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Which {
+    Even,
+    Odd,
+    Mixed,
+}
+
+const PASSES: [Which; REFINER_PASSES] = [Which::Even, Which::Odd, Which::Mixed];
+
+impl Which {
+    /// The parity of the columns of a row that it goes through, if it does.
+    fn columns(self, row: usize) -> Option<usize> {
+        let parity = row % 2;
+        match self {
+            Self::Even => (parity == 0).then_some(0),
+            Self::Odd => (parity == 1).then_some(1),
+            Self::Mixed => Some(1 - parity),
+        }
+    }
+}
 
 /// By how many factors of three the split makes the old points of a place more precise.
 fn depth(coding: &Coding, level: u32, place: Place) -> u8 {
@@ -52,38 +85,40 @@ pub(super) fn walk_corrections<P: Pass>(
         return Ok(());
     }
     let finest = PLACES.map(|p| coding.exponent(level, p));
-    let mut raster = turned.then(|| Turned::of(block));
-    let (side, points) = match &mut raster {
-        Some(raster) => (raster.side(), raster.heights.as_mut_slice()),
-        None => (block.segments() + 1, block.parts_mut().0),
-    };
-    let holes = points.contains(&NODATA);
-    let mut thirds = Thirds::new(side, turned);
-    for round in (1..=rounds).rev() {
-        for v in 1..side - 1 {
-            thirds.clear(v);
-            let (runs, count) = if turned { runs_turned(side, v, upper) } else { runs(side, v, upper) };
+    let refiners = coding.model().refiners(level);
+    let tables = coding.model().tables();
+    let mut raster = Raster::of(block, upper, turned);
+    let side = raster.side;
+    let mut thirds = Thirds::default();
+    for (round, which) in (1..=rounds).rev().flat_map(|round| PASSES.map(|p| (round, p))) {
+        let refiner = &refiners[which as usize];
+        for y in 1..side - 1 {
+            let Some(parity) = which.columns(y) else { continue };
+            thirds.clear();
+            let (runs, count) = if turned { runs_turned(side, y, upper) } else { runs(side, y, upper) };
             for Run { from, to, place } in runs.into_iter().take(count) {
                 let at = PLACES.iter().position(|p| *p == place).unwrap_or(0);
+                let from = from + usize::from(from % 2 != parity);
                 if depths[at] < round || from >= to {
                     continue;
                 }
                 let step = coding.step(finest[at] + round - 1);
-                let slots = v * side + from..v * side + to;
-                if holes {
-                    for slot in slots.filter(|s| points[*s] != NODATA) {
-                        thirds.push(points, slot, step);
-                    }
-                } else {
-                    thirds.push_all(points, slots, step);
+                let count = (to - from).div_ceil(2);
+                thirds.add(&raster, [from, y], count, step, &Expect::new(refiner, step));
+            }
+            if P::LEARNS {
+                for third in &thirds.runs {
+                    third.learn(&raster, which as usize, pass);
                 }
             }
-            thirds.pass(coding, pass, points, tally)?;
+            thirds.numbers.clear();
+            thirds.numbers.resize(thirds.classes.len(), 0);
+            pass.receive_corrections(tables, &thirds.classes, &mut thirds.numbers);
+            thirds.apply(&mut raster, pass, tally)?;
+            pass.send(tables, &thirds.classes, &thirds.numbers);
         }
     }
-    if let Some(raster) = raster {
-        raster.give_back(block);
-    }
+    raster.give_back(block);
     Ok(())
 }
 
@@ -131,163 +166,317 @@ fn runs_turned(side: usize, v: usize, upper: bool) -> ([Run; 5], usize) {
         _ => (Place::Off, Place::OtherDiagonal),
     };
     let run = |from, to, place| Run { from, to, place };
-    let runs =
-        [run(from, m, along), run(m, m + 1, middle), run(m + 1, to, along), Run::NONE, Run::NONE];
+    let runs = [run(from, m, along), run(m, m + 1, middle), run(m + 1, to, along), Run::NONE, Run::NONE];
     (runs, 3)
 }
 
-/// A block with known centres, in rows along the lattice; without height outside of the diamond.
-struct Turned {
-    m: usize,
+/// Points beyond the grid's border on each side, so that all have neighbours two steps away.
+const MARGIN: usize = 2;
+
+/// The known points of a block as rows, each with its even columns first and then its odd ones: what a pass
+/// looks at lies side by side.
+///
+/// Outside of the diamond, and where there is no height, a row goes on with its nearest point to the west, or
+/// else to the east, and beyond the last row with that row: neighbours are expected from there, too.
+struct Raster {
+    /// Points along each side.
+    side: usize,
+    turned: bool,
+    /// Points that have no height, by position, if there are any.
+    holes: Vec<bool>,
+    stride: usize,
     heights: Vec<i32>,
 }
 
-impl Turned {
-    fn of(block: &Block) -> Self {
-        let m = block.segments();
-        let mut turned = Self { m, heights: vec![NODATA; (2 * m + 1) * (2 * m + 1)] };
-        for [p, q] in block.places() {
-            let at = turned.at(p, q);
-            turned.heights[at] = block.heights()[Block::slot(m, p, q)];
+impl Raster {
+    fn of(block: &Block, upper: bool, turned: bool) -> Self {
+        let n = block.segments();
+        let side = if turned { 2 * n + 1 } else { n + 1 };
+        let stride = (side + 2 * MARGIN).next_multiple_of(2);
+        let heights = vec![NODATA; stride * (side + 2 * MARGIN)];
+        let mut raster = Self { side, turned, holes: Vec::new(), stride, heights };
+        let (mut line, mut before) = (vec![NODATA; side], vec![0; side]);
+        for y in 0..side {
+            let (from, to) = raster.span(y, upper);
+            line.fill(NODATA);
+            for x in from..to {
+                line[x] = block.heights()[raster.slot(x, y)];
+            }
+            if line[from..to].contains(&NODATA) {
+                raster.holes.resize(raster.heights.len(), false);
+                for x in (from..to).filter(|x| line[*x] == NODATA) {
+                    let at = raster.at(x, y);
+                    raster.holes[at] = true;
+                }
+            }
+            if let Some(first) = line.iter().copied().find(|h| *h != NODATA) {
+                let mut last = first;
+                for height in &mut line {
+                    last = if *height == NODATA { last } else { *height };
+                    *height = last;
+                }
+            } else {
+                line.copy_from_slice(&before);
+            }
+            raster.put(y + MARGIN, &line);
+            std::mem::swap(&mut line, &mut before);
         }
-        turned
+        for margin in 0..MARGIN {
+            let (first, last) = (MARGIN * stride, (side + MARGIN - 1) * stride);
+            raster.heights.copy_within(first..first + stride, margin * stride);
+            raster.heights.copy_within(last..last + stride, (side + MARGIN + margin) * stride);
+        }
+        raster
     }
 
-    fn side(&self) -> usize {
-        2 * self.m + 1
+    /// The columns of a row that lie in the diamond.
+    fn span(&self, y: usize, upper: bool) -> (usize, usize) {
+        if !self.turned {
+            return (if upper { 0 } else { y }, self.side);
+        }
+        let m = self.side / 2;
+        if y > m && !upper { (0, 0) } else { (y.abs_diff(m), self.side - y.abs_diff(m)) }
     }
 
-    fn at(&self, p: usize, q: usize) -> usize {
-        (q + 2 * self.m - p) / 2 * self.side() + (p + q) / 2
+    /// Where the block has a point of the diamond.
+    #[inline(always)]
+    fn slot(&self, x: usize, y: usize) -> usize {
+        if !self.turned {
+            return y * self.side + x;
+        }
+        let m = self.side / 2;
+        Block::slot(m, x + m - y, x + y - m)
+    }
+
+    /// Writes a row, margins included.
+    fn put(&mut self, row: usize, line: &[i32]) {
+        let (even, odd) = self.heights[row * self.stride..][..self.stride].split_at_mut(self.stride / 2);
+        let last = line.len() - 1;
+        let column = |x: usize| line[x.saturating_sub(MARGIN).min(last)];
+        for (i, (even, odd)) in even.iter_mut().zip(odd).enumerate() {
+            (*even, *odd) = (column(2 * i), column(2 * i + 1));
+        }
+    }
+
+    /// The position of a point.
+    #[inline(always)]
+    fn at(&self, x: usize, y: usize) -> usize {
+        let x = x + MARGIN;
+        (y + MARGIN) * self.stride + x % 2 * (self.stride / 2) + x / 2
+    }
+
+    /// `count` points, every other one from `x + dx` on, of the row at `y + dy`.
+    #[inline(always)]
+    fn line(&self, [x, y]: [usize; 2], [dx, dy]: [isize; 2], count: usize) -> &[i32] {
+        let x = (x + MARGIN).wrapping_add_signed(dx);
+        let row = (y + MARGIN).wrapping_add_signed(dy) * self.stride;
+        let at = row + x % 2 * (self.stride / 2) + x / 2;
+        &self.heights[at..at + count]
     }
 
     fn give_back(&self, block: &mut Block) {
-        let m = self.m;
-        for [p, q] in block.places() {
-            let height = self.heights[self.at(p, q)];
-            let (old, centres) = block.parts_mut();
-            match Block::slot(m, p, q) {
-                slot if slot < old.len() => old[slot] = height,
-                slot => centres[slot - old.len()] = height,
+        let old_count = block.parts().0.len();
+        let (old, centres) = block.parts_mut();
+        for y in 0..self.side {
+            let (from, to) = self.span(y, true);
+            for x in from..to {
+                let (slot, height) = (self.slot(x, y), self.heights[self.at(x, y)]);
+                let point = if slot < old_count { &mut old[slot] } else { &mut centres[slot - old_count] };
+                // What has no height keeps none, and so does the half that is outside of the forest.
+                if *point != NODATA {
+                    *point = height;
+                }
             }
         }
     }
 }
 
 /// A row's worth of corrections by a third, in the order of the row.
+#[derive(Debug, Default)]
 struct Thirds {
-    side: usize,
-    turned: bool,
-    row: usize,
-    slots: Vec<usize>,
-    steps: Vec<i32>,
-    /// Whether the neighbours lie lower: towards them counts as up.
-    down: Vec<bool>,
+    runs: Vec<Third>,
     classes: Vec<u8>,
+    /// Whether a point is expected lower: towards that counts as up.
+    down: Vec<bool>,
     numbers: Vec<i32>,
 }
 
-/// The class of a correction by `1 / per_step` of a point with these neighbours to the west, east, south
-/// and north; and whether they lie lower.
-#[inline(always)]
-fn third(here: i32, [w, e, s, n]: [i32; 4], per_step: f32) -> (u8, bool) {
-    // How far the neighbours' mean lies to one side, in parts of the three steps to choose from.
-    const TILT: [f32; TILTS - 1] = [0.06, 0.18, 0.35, 0.6, 1.2];
-    const ROUGH: [f32; ROUGHNESSES - 1] = [6.0, 18.0];
-    let tilt = w + e + s + n - 4 * here;
-    let aside = tilt.abs() as f32 * (per_step * (1.0 / 12.0));
-    let bends = (2 * (w + e - s - n).abs() + (w - e).abs() + (s - n).abs()) as f32 * (per_step * 0.25);
-    let tilted: u8 = TILT.iter().map(|limit| u8::from(aside >= *limit)).sum();
-    let rough: u8 = ROUGH.iter().map(|limit| u8::from(bends >= *limit)).sum();
-    (correction_class(tilted, rough), tilt < 0)
+/// What a correction is expected from, in quanta.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Parts {
+    /// What neighbours lie higher: those to the west and east, the south, the north, the two south and the two
+    /// north of those; two steps away those to the west and east, the south, the north, and the four a
+    /// knight's move to the south and to the north.
+    pub(super) tilt: [f32; TILT_PARTS],
+    /// What they differ among themselves; without the constant.
+    pub(super) spread: [f32; SPREAD_PARTS - 1],
+}
+
+/// The neighbours of a run of points.
+struct Around<'a> {
+    here: &'a [i32],
+    near: [&'a [i32]; 8],
+    far: [&'a [i32]; 12],
+}
+
+impl<'a> Around<'a> {
+    #[inline(always)]
+    fn new(raster: &'a Raster, place: [usize; 2], count: usize) -> Self {
+        const NEAR: [[isize; 2]; 8] = [[-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [1, -1], [-1, 1], [1, 1]];
+        const FAR: [[isize; 2]; 12] = [
+            [-2, 0],
+            [2, 0],
+            [0, -2],
+            [0, 2],
+            [-2, -1],
+            [2, -1],
+            [-1, -2],
+            [1, -2],
+            [-2, 1],
+            [2, 1],
+            [-1, 2],
+            [1, 2],
+        ];
+        let line = |d: [isize; 2]| raster.line(place, d, count);
+        Self { here: line([0, 0]), near: NEAR.map(line), far: FAR.map(line) }
+    }
+
+    #[inline(always)]
+    fn parts(&self, i: usize) -> Parts {
+        let h = self.here[i];
+        let [w, e, s, n, sw, se, nw, ne] = self.near.map(|line| line[i] - h);
+        let [ww, ee, ss, nn, a, b, c, d, f, g, j, k] = self.far.map(|line| line[i] - h);
+        Parts {
+            tilt: [w + e, s, n, sw + se, nw + ne, ww + ee, ss, nn, a + b + c + d, f + g + j + k]
+                .map(|d| d as f32),
+            spread: [
+                (w + e - s - n).abs() as f32,
+                ((w - e).abs() + (s - n).abs()) as f32,
+                (sw + ne - se - nw).abs() as f32,
+            ],
+        }
+    }
+}
+
+/// The weights of a level, for one step.
+#[derive(Debug, Clone, Copy)]
+struct Expect {
+    tilt: [f32; TILT_PARTS],
+    spread: [f32; SPREAD_PARTS],
+}
+
+impl Expect {
+    fn new(refiner: &Refiner, step: i32) -> Self {
+        let per_step = 1.0 / step as f32;
+        let mut spread = refiner.spread().map(|w| w * per_step);
+        spread[SPREAD_PARTS - 1] = refiner.spread()[SPREAD_PARTS - 1];
+        Self { tilt: refiner.tilt().map(|w| w * per_step), spread }
+    }
+
+    /// The class of a correction, and whether it is expected to be downwards.
+    #[inline(always)]
+    fn class(&self, parts: &Parts) -> (u8, bool) {
+        // In steps: the outer thirds begin at half a step.
+        const TILT: [f32; TILTS - 1] = [0.1, 0.25, 0.5, 0.8, 1.2, 2.0];
+        const LEAST: f32 = 0.0625;
+        const MOST: f32 = LEAST * (1 << (SPREADS - 1)) as f32;
+        let mut tilt = 0.0;
+        for (weight, part) in self.tilt.iter().zip(parts.tilt) {
+            tilt += weight * part;
+        }
+        let [a, b, c, d] = self.spread;
+        let spread = a * parts.spread[0] + b * parts.spread[1] + c * parts.spread[2] + d;
+        let aside = tilt.abs();
+        let tilted: u8 = TILT.iter().map(|limit| u8::from(aside >= *limit)).sum();
+        // An octave a class.
+        let spread = if spread > LEAST { spread } else { LEAST };
+        let spread = if spread < MOST { spread } else { MOST };
+        let spread = ((spread.to_bits() >> 23) - (LEAST.to_bits() >> 23)) as u8;
+        (FIRST_CORRECTION + spread * TILTS as u8 + tilted, tilt < 0.0)
+    }
+}
+
+/// Every other point from `place` on, along a row.
+#[derive(Debug, Clone, Copy)]
+struct Third {
+    place: [usize; 2],
+    count: usize,
+    step: i32,
+}
+
+impl Third {
+    /// Shows a pass what each of the corrections is expected from.
+    fn learn<P: Pass>(&self, raster: &Raster, which: usize, pass: &mut P) {
+        let ([x, y], around) = (self.place, Around::new(raster, self.place, self.count));
+        for i in 0..self.count {
+            if raster.holes.is_empty() || !raster.holes[raster.at(x + 2 * i, y)] {
+                pass.learn(which, raster.slot(x + 2 * i, y), around.here[i], self.step, &around.parts(i));
+            }
+        }
+    }
 }
 
 impl Thirds {
-    fn new(side: usize, turned: bool) -> Self {
-        Self {
-            side,
-            turned,
-            row: 0,
-            slots: Vec::with_capacity(side),
-            steps: Vec::with_capacity(side),
-            down: Vec::with_capacity(side),
-            classes: Vec::with_capacity(side),
-            numbers: Vec::with_capacity(side),
-        }
-    }
-
-    fn clear(&mut self, row: usize) {
-        self.row = row;
-        self.slots.clear();
-        self.steps.clear();
-        self.down.clear();
+    fn clear(&mut self) {
+        self.runs.clear();
         self.classes.clear();
+        self.down.clear();
     }
 
-    /// Adds the point at `slot`, to be moved by a `step` or not at all.
-    fn push(&mut self, points: &[i32], slot: usize, step: i32) {
-        let here = points[slot];
-        let near = [slot - 1, slot + 1, slot - self.side, slot + self.side];
-        let near = near.map(|slot| if points[slot] == NODATA { here } else { points[slot] });
-        let (class, down) = third(here, near, 1.0 / step as f32);
-        self.slots.push(slot);
-        self.steps.push(step);
-        self.classes.push(class);
-        self.down.push(down);
-    }
-
-    /// Adds a run of points whose neighbours all have heights.
-    fn push_all(&mut self, points: &[i32], slots: Range<usize>, step: i32) {
-        let (from, count) = (slots.start, slots.len());
-        let per_step = 1.0 / step as f32;
-        let line = |at: usize| &points[at..at + count];
-        let (here, w, e) = (line(from), line(from - 1), line(from + 1));
-        let (s, north) = (line(from - self.side), line(from + self.side));
+    /// Adds every other of a run of points, each to be moved by a `step` or not at all.
+    fn add(&mut self, raster: &Raster, place: [usize; 2], count: usize, step: i32, expect: &Expect) {
+        let around = Around::new(raster, place, count);
         let start = self.classes.len();
-        self.slots.extend(slots);
-        self.steps.resize(start + count, step);
         self.classes.resize(start + count, 0);
         self.down.resize(start + count, false);
         let (classes, down) = (&mut self.classes[start..][..count], &mut self.down[start..][..count]);
-        for u in 0..count {
-            (classes[u], down[u]) = third(here[u], [w[u], e[u], s[u], north[u]], per_step);
+        for i in 0..count {
+            (classes[i], down[i]) = expect.class(&around.parts(i));
         }
+        self.runs.push(Third { place, count, step });
+        if raster.holes.is_empty() {
+            return;
+        }
+        // Without height there is nothing to correct.
+        let [x, y] = place;
+        let mut kept = start;
+        for i in 0..count {
+            if !raster.holes[raster.at(x + 2 * i, y)] {
+                (self.classes[kept], self.down[kept]) = (self.classes[start + i], self.down[start + i]);
+                kept += 1;
+            }
+        }
+        self.classes.truncate(kept);
+        self.down.truncate(kept);
     }
 
-    /// Where the block has the point at `slot`.
-    #[inline(always)]
-    fn in_block(&self, slot: usize) -> usize {
-        if !self.turned {
-            return slot;
-        }
-        let (m, x) = (self.side / 2, slot - self.row * self.side);
-        Block::slot(m, x + m - self.row, x + self.row - m)
-    }
-
-    fn pass<P: Pass>(
+    /// Moves the points by their numbers: those that were received, or those that the source asks for.
+    fn apply<P: Pass>(
         &mut self,
-        coding: &Coding,
+        raster: &mut Raster,
         pass: &mut P,
-        points: &mut [i32],
         tally: &mut Tally,
     ) -> Result<(), DecodeError> {
-        let tables = coding.model().tables();
-        let mut numbers = std::mem::take(&mut self.numbers);
-        numbers.clear();
-        numbers.resize(self.slots.len(), 0);
-        pass.receive(tables, &self.classes, &mut numbers);
-        let places = self.slots.iter().zip(&self.steps).zip(&self.down);
-        for (((slot, step), down), number) in places.zip(&mut numbers) {
-            let base = points[*slot];
-            let turn = |k: i32| if *down { -k } else { k };
-            let wanted = |h: i32| turn(steps(h - base, *step).clamp(-1, 1));
-            *number = pass.number(*number, self.in_block(*slot), wanted);
-            // Where numbers are damaged they are still small: tables of corrections have three symbols.
-            points[*slot] = moved(base, turn(*number), *step)?;
-            tally.corrected += u32::from(*number != 0);
+        let (mut next, mut beyond) = (0, 0);
+        for Third { place: [x, y], count, step } in self.runs.iter().copied() {
+            let first = raster.at(x, y);
+            for i in 0..count {
+                if !raster.holes.is_empty() && raster.holes[first + i] {
+                    continue;
+                }
+                let base = raster.heights[first + i];
+                let turn = |k: i32| if self.down[next] { -k } else { k };
+                let wanted = |h: i32| turn(steps(h - base, step).clamp(-1, 1));
+                let number = pass.number(self.numbers[next], raster.slot(x + 2 * i, y), wanted);
+                self.numbers[next] = number;
+                // Where numbers are damaged they are still small: corrections have three symbols.
+                let height = base + turn(number) * step;
+                beyond |= height.unsigned_abs() >> HEIGHT_BITS;
+                raster.heights[first + i] = height;
+                tally.corrected += u32::from(number != 0);
+                next += 1;
+            }
         }
-        pass.send(tables, &self.classes, &numbers);
-        self.numbers = numbers;
-        Ok(())
+        if beyond == 0 { Ok(()) } else { Err(DecodeError::Height) }
     }
 }

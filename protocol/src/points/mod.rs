@@ -60,6 +60,7 @@ use crate::bintree::Forest;
 use crate::diamond::{Block, Diamond};
 use crate::rans::{Context, Decoder, Encoder};
 use crate::{HEIGHT_MAX, NODATA};
+use corrections::Parts;
 use model::{Counts, Tables};
 use walk::{Known, is_inferred, walk, walk_new};
 
@@ -172,7 +173,8 @@ pub fn encode(forest: &Forest, coding: &Coding, d: Diamond, block: &mut Block, s
 
 /// Like [`encode`], without the bytes: leaves in `block` what a receiver will have.
 pub fn quantise(forest: &Forest, coding: &Coding, d: Diamond, block: &mut Block, source: &Block) {
-    let _ = walk(forest, coding, d, block, Known::Sent, &mut Rounder { source: source.heights(), counts: None });
+    let _ =
+        walk(forest, coding, d, block, Known::Sent, &mut Rounder { source: source.heights(), counts: None });
 }
 
 /// Completes `block`, which holds the known points of `d` (none at level 0), from a payload.
@@ -225,10 +227,17 @@ fn infer(forest: &Forest, coding: &Coding, d: Diamond, block: &mut Block) -> Res
 /// One pass over a diamond's symbols, whichever way they flow. A single walk serves sender and
 /// receiver, so they cannot disagree about contexts, order or predictions.
 trait Pass {
+    /// Whether it wants to know what corrections are expected from.
+    const LEARNS: bool = false;
     /// Whether the point at `slot` has a height.
     fn valid(&mut self, context: &mut Context, slot: usize) -> bool;
     /// A receiver's numbers of these classes; a sender leaves them alone.
     fn receive(&mut self, tables: &Tables, classes: &[u8], numbers: &mut [i32]);
+    /// Likewise corrections.
+    fn receive_corrections(&mut self, _: &Tables, _: &[u8], _: &mut [i32]) {}
+    /// What is known of a correction by `step` that the point at `slot`, now at `here`, may take: only if
+    /// [`Pass::LEARNS`].
+    fn learn(&mut self, _pass: usize, _slot: usize, _here: i32, _step: i32, _parts: &Parts) {}
     /// The number of the point at `slot`: what was received, or what `wanted` computes from the source.
     fn number(&mut self, received: i32, slot: usize, wanted: impl Fn(i32) -> i32) -> i32;
     /// A sender's numbers go out; a receiver has them already.
@@ -332,6 +341,9 @@ impl Pass for Receiver<'_> {
     }
     fn receive(&mut self, tables: &Tables, classes: &[u8], numbers: &mut [i32]) {
         tables.decode(&mut self.coder, classes, numbers);
+    }
+    fn receive_corrections(&mut self, tables: &Tables, classes: &[u8], numbers: &mut [i32]) {
+        tables.decode_corrections(&mut self.coder, classes, numbers);
     }
     fn number(&mut self, received: i32, _: usize, _: impl Fn(i32) -> i32) -> i32 {
         received

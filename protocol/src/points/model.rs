@@ -27,12 +27,12 @@ pub const CLASSES: usize = 40;
 /// The activity of the first class is 2^-OCTAVES_BELOW.
 const OCTAVES_BELOW: u32 = 8;
 
-/// Classes of corrections: tilt towards one side, times roughness.
-pub const CORRECTION_CLASSES: usize = TILTS * ROUGHNESSES;
-/// Kinds of tilt of a correction.
-pub const TILTS: usize = 6;
-/// Kinds of roughness of a correction.
-pub const ROUGHNESSES: usize = 3;
+/// Classes of corrections: how far to one side a point is expected, times how sure that is.
+pub const CORRECTION_CLASSES: usize = TILTS * SPREADS;
+/// Kinds of tilt: how far to one side.
+pub const TILTS: usize = 7;
+/// Kinds of spread: how sure.
+pub const SPREADS: usize = 9;
 
 /// Hazards of a table.
 pub const HAZARDS: usize = 8;
@@ -101,12 +101,52 @@ impl Kernel {
     }
 }
 
+/// What is expected of the corrections of a level in one of its passes; see `corrections`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Refiner {
+    /// Weights, in 1/4096, of what the neighbours differ: the place where a point is expected.
+    pub tilt: [i16; TILT_PARTS],
+    /// Weights, in 1/4096, of how the neighbours differ among themselves, and of a step: how far off that
+    /// place may be.
+    pub spread: [i16; SPREAD_PARTS],
+}
+
+/// Passes over the points that a split corrects, each with weights of its own.
+pub const REFINER_PASSES: usize = 3;
+/// Parts of the place where a point is expected.
+pub const TILT_PARTS: usize = 10;
+/// Parts of how far off it may be; the last one is a constant.
+pub const SPREAD_PARTS: usize = 4;
+
+impl Default for Refiner {
+    /// The mean of the four neighbours.
+    fn default() -> Self {
+        Self { tilt: [1024, 1024, 1024, 0, 0, 0, 0, 0, 0, 0], spread: [600, 400, 200, 1200] }
+    }
+}
+
+impl Refiner {
+    /// The weights as numbers.
+    #[must_use]
+    pub fn tilt(&self) -> [f32; TILT_PARTS] {
+        self.tilt.map(|w| f32::from(w) * WEIGHT)
+    }
+
+    /// The weights as numbers.
+    #[must_use]
+    pub fn spread(&self) -> [f32; SPREAD_PARTS] {
+        self.spread.map(|w| f32::from(w) * WEIGHT)
+    }
+}
+
 /// The model of a layer.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "ModelParts", into = "ModelParts")]
 pub struct Model {
     /// Kernels by level; beyond the last one, that of the same parity before it.
     levels: Vec<[Kernel; 2]>,
+    /// By level; beyond the last one, the last.
+    refiners: Vec<[Refiner; REFINER_PASSES]>,
     numbers: [[u16; HAZARDS]; CLASSES],
     corrections: [[u16; 2]; CORRECTION_CLASSES],
     tables: Arc<Tables>,
@@ -115,6 +155,7 @@ pub struct Model {
 #[derive(Clone, Serialize, Deserialize)]
 struct ModelParts {
     levels: Vec<[Kernel; 2]>,
+    refiners: Vec<[Refiner; REFINER_PASSES]>,
     numbers: Vec<[u16; HAZARDS]>,
     corrections: Vec<[u16; 2]>,
 }
@@ -141,8 +182,10 @@ impl TryFrom<ModelParts> for Model {
     type Error = ModelError;
     fn try_from(p: ModelParts) -> Result<Self, ModelError> {
         let count = |what, found, expected| ModelError::Count { what, found, expected };
-        if p.levels.is_empty() || p.levels.len() > 64 {
-            return Err(count("levels", p.levels.len(), 64));
+        for found in [p.levels.len(), p.refiners.len()] {
+            if !(1..=64).contains(&found) {
+                return Err(count("levels", found, 64));
+            }
         }
         let numbers = <[_; CLASSES]>::try_from(p.numbers);
         let numbers = numbers.map_err(|v| count("classes of numbers", v.len(), CLASSES))?;
@@ -153,13 +196,14 @@ impl TryFrom<ModelParts> for Model {
         if let Some(bad) = all.copied().find(|h| !(1..TOTAL as u16).contains(h)) {
             return Err(ModelError::Hazard(bad));
         }
-        Ok(Self::new(p.levels, numbers, corrections))
+        Ok(Self::new(p.levels, p.refiners, numbers, corrections))
     }
 }
 
 impl From<Model> for ModelParts {
     fn from(m: Model) -> Self {
-        Self { levels: m.levels, numbers: m.numbers.to_vec(), corrections: m.corrections.to_vec() }
+        let (numbers, corrections) = (m.numbers.to_vec(), m.corrections.to_vec());
+        Self { levels: m.levels, refiners: m.refiners, numbers, corrections }
     }
 }
 
@@ -169,29 +213,41 @@ impl Default for Model {
         // A correction is one of three: even odds first, then two to one for the nearer side.
         let corrections = std::array::from_fn(|c| {
             let tilt = (c % TILTS) as u16;
-            [1400, 2048 + 200 * tilt]
+            [1400, 2048 + 180 * tilt]
         });
-        Self::new(vec![[Kernel::default(); 2]], numbers, corrections)
+        Self::new(
+            vec![[Kernel::default(); 2]],
+            vec![[Refiner::default(); REFINER_PASSES]],
+            numbers,
+            corrections,
+        )
     }
 }
 
 impl Model {
-    /// From kernels (at least one level), hazards by class, and those of corrections; hazards in
-    /// 1..[`TOTAL`].
+    /// From kernels and refiners (of at least one level), hazards by class, and those of corrections; hazards
+    /// in 1..[`TOTAL`].
     #[must_use]
     pub fn new(
         levels: Vec<[Kernel; 2]>,
+        refiners: Vec<[Refiner; REFINER_PASSES]>,
         numbers: [[u16; HAZARDS]; CLASSES],
         corrections: [[u16; 2]; CORRECTION_CLASSES],
     ) -> Self {
         let tables = Arc::new(Tables::new(&numbers, &corrections));
-        Self { levels, numbers, corrections, tables }
+        Self { levels, refiners, numbers, corrections, tables }
     }
 
-    /// With these kernels and hazards that know nothing of the layer.
+    /// With these kernels and refiners, and hazards that know nothing of the layer.
     #[must_use]
-    pub fn of_kernels(levels: Vec<[Kernel; 2]>) -> Self {
-        Self { levels, ..Self::default() }
+    pub fn of_weights(levels: Vec<[Kernel; 2]>, refiners: Vec<[Refiner; REFINER_PASSES]>) -> Self {
+        Self { levels, refiners, ..Self::default() }
+    }
+
+    /// The refiners of a level.
+    #[must_use]
+    pub fn refiners(&self, level: u32) -> &[Refiner; REFINER_PASSES] {
+        &self.refiners[(level as usize).min(self.refiners.len() - 1)]
     }
 
     /// The kernel of a level in one of the two ways.
@@ -311,42 +367,51 @@ impl Table {
         shares[ZERO] += TOTAL - used - escape;
         Self::from_shares(&shares, shift, direct)
     }
-
-    fn of_corrections([zero, nearer]: [u16; 2]) -> Self {
-        let zero = u32::from(zero).min(TOTAL - 2);
-        let rest = TOTAL - zero;
-        let nearer = ((rest * u32::from(nearer)) >> PRECISION).clamp(1, rest - 1);
-        let mut shares = [0u32; SYMBOLS];
-        (shares[ZERO], shares[ZERO + 1], shares[ZERO - 1]) = (zero, nearer, rest - nearer);
-        Self::from_shares(&shares, 0, 1)
-    }
 }
 
-/// The tables of a model: those of numbers by class, then those of corrections. Takes 4.4 kB a class.
+/// The tables of a model, by class. Those of numbers take 4.4 kB each.
 #[derive(Clone, PartialEq, Eq)]
-pub struct Tables(Vec<Table>);
+pub struct Tables {
+    numbers: Vec<Table>,
+    corrections: Vec<Thirds>,
+}
+
+/// Where the shares of moving down, of staying and of moving up begin, and where the last one ends.
+type Thirds = [u16; 4];
+
+/// The shares of a correction: of staying, and of moving to the nearer side where it moves.
+fn thirds([zero, nearer]: [u16; 2]) -> Thirds {
+    let zero = u32::from(zero).min(TOTAL - 2);
+    let rest = TOTAL - zero;
+    let nearer = ((rest * u32::from(nearer)) >> PRECISION).clamp(1, rest - 1);
+    let farther = rest - nearer;
+    [0, farther as u16, (farther + zero) as u16, TOTAL as u16]
+}
 
 impl std::fmt::Debug for Tables {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "Tables of {} classes", self.0.len())
+        write!(f, "Tables of {} classes", self.numbers.len() + self.corrections.len())
     }
 }
 
-/// The class of a correction among all classes.
-#[must_use]
-pub fn correction_class(tilt: u8, roughness: u8) -> u8 {
-    CLASSES as u8 + roughness * TILTS as u8 + tilt
-}
+/// Classes from this one on are those of corrections.
+pub const FIRST_CORRECTION: u8 = CLASSES as u8;
 
 impl Tables {
     fn new(numbers: &[[u16; HAZARDS]; CLASSES], corrections: &[[u16; 2]; CORRECTION_CLASSES]) -> Self {
-        let numbers = numbers.iter().enumerate().map(|(c, h)| Table::of_numbers(h, class_shift(c)));
-        Self(numbers.chain(corrections.iter().map(|c| Table::of_corrections(*c))).collect())
+        let numbers = numbers.iter().enumerate().map(|(c, h)| Table::of_numbers(h, class_shift(c))).collect();
+        Self { numbers, corrections: corrections.iter().map(|c| thirds(*c)).collect() }
     }
 
     /// Appends a number, of magnitude below 2^27, under its class.
     pub fn encode(&self, coder: &mut Encoder, lane: u8, class: u8, value: i32) {
-        let table = &self.0[usize::from(class)];
+        if let Some(correction) = class.checked_sub(FIRST_CORRECTION) {
+            let bounds = &self.corrections[usize::from(correction)];
+            let k = (value.clamp(-1, 1) + 1) as usize;
+            coder.symbol(lane, bounds[k], bounds[k + 1] - bounds[k]);
+            return;
+        }
+        let table = &self.numbers[usize::from(class)];
         // Bins are centred on zero.
         let half = (1 << table.shift) >> 1;
         let bin = (value + half) >> table.shift;
@@ -369,7 +434,50 @@ impl Tables {
         }
     }
 
-    /// Reads as many numbers as there are classes, the lanes taking turns.
+    /// Reads as many corrections as there are classes, all of corrections, the lanes taking turns.
+    #[inline]
+    pub fn decode_corrections(&self, coder: &mut Decoder, classes: &[u8], numbers: &mut [i32]) {
+        if coder.lanes() == 2 {
+            self.decode_corrections_in::<2>(coder, classes, numbers)
+        } else {
+            self.decode_corrections_in::<1>(coder, classes, numbers)
+        }
+    }
+
+    fn decode_corrections_in<const LANES: usize>(
+        &self,
+        coder: &mut Decoder,
+        classes: &[u8],
+        numbers: &mut [i32],
+    ) {
+        let Ok(tables) = <&[Thirds; CORRECTION_CLASSES]>::try_from(self.corrections.as_slice()) else {
+            return;
+        };
+        let mut local = *coder;
+        let mut states = local.states();
+        for (classes, numbers) in classes.chunks(LANES).zip(numbers.chunks_mut(LANES)) {
+            for (lane, (class, number)) in classes.iter().zip(numbers).enumerate() {
+                let class = usize::from(class.wrapping_sub(FIRST_CORRECTION)).min(CORRECTION_CLASSES - 1);
+                let bounds = tables[class].map(u32::from);
+                let state = states[lane];
+                let slot = state % TOTAL;
+                let (up, down) = (slot >= bounds[2], slot < bounds[1]);
+                let (start, end) = if up {
+                    (bounds[2], bounds[3])
+                } else if down {
+                    (0, bounds[1])
+                } else {
+                    (bounds[1], bounds[2])
+                };
+                states[lane] = local.refill((end - start) * (state >> PRECISION) + slot - start);
+                *number = i32::from(up) - i32::from(down);
+            }
+        }
+        local.set_states(states);
+        *coder = local;
+    }
+
+    /// Reads as many numbers as there are classes, all of numbers, the lanes taking turns.
     ///
     /// A damaged payload gives numbers of no meaning, of magnitude below 2^31.
     #[inline]
@@ -387,7 +495,7 @@ impl Tables {
         let mut states = local.states();
         for (classes, numbers) in classes.chunks(LANES).zip(numbers.chunks_mut(LANES)) {
             for (lane, (class, number)) in classes.iter().zip(numbers).enumerate() {
-                let Some(table) = self.0.get(usize::from(*class)) else { continue };
+                let Some(table) = self.numbers.get(usize::from(*class)) else { continue };
                 let state = states[lane];
                 let slot = state % TOTAL;
                 let symbol = table.symbol[slot as usize];
@@ -500,7 +608,7 @@ impl Counts {
 
     /// The model with these kernels whose hazards fit the counts, where there are enough of them.
     #[must_use]
-    pub fn model(&self, levels: Vec<[Kernel; 2]>) -> Model {
+    pub fn model(&self, levels: Vec<[Kernel; 2]>, refiners: Vec<[Refiner; REFINER_PASSES]>) -> Model {
         // What a hazard is worth before anything is counted.
         const PRIOR: u64 = 12;
         let hazard = |stopped: u64, reached: u64, prior: u16| {
@@ -519,7 +627,7 @@ impl Counts {
             let prior = start.1[c];
             [hazard(zero, farther + zero + nearer, prior[0]), hazard(nearer, farther + nearer, prior[1])]
         });
-        Model::new(levels, numbers, corrections)
+        Model::new(levels, refiners, numbers, corrections)
     }
 
     fn prior() -> ([[u16; HAZARDS]; CLASSES], [[u16; 2]; CORRECTION_CLASSES]) {
@@ -572,6 +680,28 @@ mod tests {
         }
 
         #[test]
+        fn any_correction_comes_back_under_any_table(
+            hazards in any_hazards(),
+            items in prop::collection::vec((0..CORRECTION_CLASSES as u8, -1i32..=1), 1..200),
+            lanes in 1usize..=2,
+        ) {
+            let corrections = std::array::from_fn(|c| [hazards[c % HAZARDS], hazards[c / HAZARDS % HAZARDS]]);
+            let tables = Tables::new(&[hazards; CLASSES], &corrections);
+            let mut coder = Encoder::default();
+            let (classes, values): (Vec<u8>, Vec<i32>) =
+                items.into_iter().map(|(class, value)| (class + FIRST_CORRECTION, value)).unzip();
+            for (i, (class, value)) in classes.iter().zip(&values).enumerate() {
+                tables.encode(&mut coder, (i % 2) as u8, *class, *value);
+            }
+            let bytes = coder.finish(lanes);
+            let mut coder = Decoder::new(&bytes, lanes).unwrap();
+            let mut found = vec![0; values.len()];
+            tables.decode_corrections(&mut coder, &classes, &mut found);
+            prop_assert_eq!(found, values);
+            prop_assert!(coder.is_spent());
+        }
+
+        #[test]
         fn every_activity_has_a_class_and_larger_ones_no_smaller(a in any::<f32>(), b in any::<f32>()) {
             prop_assert!(usize::from(class(a)) < CLASSES);
             prop_assert!(class(a) <= class(b) || a.is_nan() || b.is_nan() || a > b, "{} {}", a, b);
@@ -591,13 +721,15 @@ mod tests {
         for i in 0..1000 {
             counts.add(class(2.0), i % 7 - 3);
         }
-        let model = counts.model(vec![[Kernel::default(); 2]; 5]);
+        let model =
+            counts.model(vec![[Kernel::default(); 2]; 5], vec![[Refiner::default(); REFINER_PASSES]; 7]);
         assert_ne!(model, Model::default());
         let text = serde_json::to_string(&model).unwrap();
         assert_eq!(serde_json::from_str::<Model>(&text).unwrap(), model);
         let zero = text.replacen(":[[4", ":[[0,4", 1);
         assert!(serde_json::from_str::<Model>(&zero).is_err());
-        let none = serde_json::from_str::<Model>(r#"{"levels":[],"numbers":[],"corrections":[]}"#);
+        let none =
+            serde_json::from_str::<Model>(r#"{"levels":[],"refiners":[],"numbers":[],"corrections":[]}"#);
         assert!(none.unwrap_err().to_string().contains("0 levels"));
     }
 
@@ -608,7 +740,7 @@ mod tests {
         for i in 0..10_000 {
             counts.add(usual, i32::from(i % 100 == 0));
         }
-        let tables = counts.model(vec![[Kernel::default(); 2]]);
+        let tables = counts.model(vec![[Kernel::default(); 2]], vec![[Refiner::default(); REFINER_PASSES]]);
         let cost = |value| {
             let mut coder = Encoder::default();
             tables.tables().encode(&mut coder, 0, usual, value);

@@ -16,14 +16,18 @@
     reason = "weights are clamped to 16 bits; heights of a block are below 2^24"
 )]
 
-use super::Rounder;
 use super::coding::{Coding, Place, Rule};
-use super::model::{CAUSAL_BITS, Counts, Kernel, Model, PAIRS};
+use super::corrections::Parts;
+use super::model::{
+    CAUSAL_BITS, Counts, Kernel, Model, PAIRS, REFINER_PASSES, Refiner, SPREAD_PARTS, TILT_PARTS, Tables,
+};
 use super::rows::Ground;
 use super::walk::{Known, walk_new, walk_old, way};
+use super::{Pass, Rounder};
 use crate::NODATA;
 use crate::bintree::Forest;
 use crate::diamond::{Block, Diamond};
+use crate::rans::Context;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// The model that suits the sampled diamonds `of` (of the finest levels, usually) and their ancestors; where
@@ -43,6 +47,7 @@ pub fn train<E>(
 ) -> Result<Model, E> {
     let levels = forest.levels();
     let mut kernels = vec![[Kernel::default(); 2]; forest.lattice_levels() as usize];
+    let mut refiners = vec![[Refiner::default(); REFINER_PASSES]; levels as usize];
     let mut counts = Counts::default();
     let mut before: BTreeMap<Diamond, Block> = BTreeMap::new();
     for (level, diamonds) in (0..levels).zip(with_ancestors(forest, of)) {
@@ -52,27 +57,32 @@ pub fn train<E>(
             for parent in forest.parents(d) {
                 block.inherit(forest, d, parent, &before[&parent]);
             }
-            let source = source(d)?;
-            let mut pass = Rounder { source: source.heights(), counts: Some(&mut counts) };
-            // A sender's heights never fail.
-            let _ = walk_old(forest, coding, level, &forest.local(d), &mut block, true, &mut pass);
-            here.push((d, block, source));
+            here.push((d, block, source(d)?));
         }
         before.clear();
+        if level > 0 {
+            refiners[level as usize] = learn_refiners(forest, coding, level, &here);
+        }
+        let learnt = coding.clone().with_model(Model::of_weights(kernels.clone(), refiners.clone()));
+        for (d, block, source) in &mut here {
+            let mut pass = Rounder { source: source.heights(), counts: Some(&mut counts) };
+            // A sender's heights never fail.
+            let _ = walk_old(forest, &learnt, level, &forest.local(*d), block, true, &mut pass);
+        }
         if !forest.adds_points(level) {
             before.extend(here.into_iter().map(|(d, block, _)| (d, block)));
             continue;
         }
         let kernels_here = learn(forest, coding, level, &here);
         kernels[level as usize] = kernels_here;
-        let learnt = coding.clone().with_model(Model::of_kernels(kernels.clone()));
+        let learnt = coding.clone().with_model(Model::of_weights(kernels.clone(), refiners.clone()));
         for (d, mut block, source) in here {
             let mut pass = Rounder { source: source.heights(), counts: Some(&mut counts) };
             let _ = walk_new(&learnt, level, &forest.local(d), &mut block, Known::Sent, &mut pass);
             before.insert(d, block);
         }
     }
-    Ok(counts.model(kernels))
+    Ok(counts.model(kernels, refiners))
 }
 
 /// Diamonds with all their ancestors, by level.
@@ -86,6 +96,76 @@ fn with_ancestors(forest: &Forest, of: &[Diamond]) -> Vec<BTreeSet<Diamond>> {
         levels[level - 1].extend(parents);
     }
     levels
+}
+
+/// The refiners of a level from its sampled diamonds: their blocks, before any correction, and sources.
+fn learn_refiners(
+    forest: &Forest,
+    coding: &Coding,
+    level: u32,
+    diamonds: &[(Diamond, Block, Block)],
+) -> [Refiner; REFINER_PASSES] {
+    let mut refiners = [Refiner::default(); REFINER_PASSES];
+    // The places first, then, twice, how far off they are: the second time weighed by what the first one found.
+    for round in 0..3 {
+        let mut fits: [_; REFINER_PASSES] = std::array::from_fn(|_| (Fit::new(), Fit::new()));
+        for (d, block, source) in diamonds {
+            let mut pass = Corrector { source: source.heights(), refiners, fits: &mut fits };
+            let mut block = block.clone();
+            let _ = walk_old(forest, coding, level, &forest.local(*d), &mut block, true, &mut pass);
+        }
+        for (refiner, (tilt, spread)) in refiners.iter_mut().zip(fits) {
+            if round == 0 {
+                let prior = refiner.tilt().map(f64::from);
+                refiner.tilt = tilt.solve(&prior).map(|w| fixed(w, 4096.0));
+            } else {
+                let prior = refiner.spread().map(f64::from);
+                refiner.spread = spread.solve(&prior).map(|w| fixed(w, 4096.0));
+            }
+        }
+    }
+    refiners
+}
+
+/// Corrects as a sender does, and gathers what each correction could be expected from.
+struct Corrector<'a> {
+    source: &'a [i32],
+    refiners: [Refiner; REFINER_PASSES],
+    /// By pass: the places, and how far off they are.
+    fits: &'a mut [(Fit<TILT_PARTS>, Fit<SPREAD_PARTS>); REFINER_PASSES],
+}
+
+impl Pass for Corrector<'_> {
+    const LEARNS: bool = true;
+
+    fn valid(&mut self, _: &mut Context, slot: usize) -> bool {
+        self.source[slot] != NODATA
+    }
+    fn receive(&mut self, _: &Tables, _: &[u8], _: &mut [i32]) {}
+    fn learn(&mut self, pass: usize, slot: usize, here: i32, step: i32, parts: &Parts) {
+        let step = f64::from(step);
+        let own = f64::from(self.source[slot] - here) / step;
+        let places = parts.tilt.map(|d| f64::from(d) / step);
+        let [a, b, c] = parts.spread.map(|d| f64::from(d) / step);
+        let ranges = [a, b, c, 1.0];
+        let sum = |weights: &[f32], parts: &[f64]| {
+            weights.iter().zip(parts).map(|(w, p)| f64::from(*w) * p).sum::<f64>()
+        };
+        // No surer than the step before let it be.
+        let expected = sum(&self.refiners[pass].spread(), &ranges).max(0.3);
+        let missing = (own - sum(&self.refiners[pass].tilt(), &places)).abs();
+        let (tilt, spread) = &mut self.fits[pass];
+        tilt.add(&places, own, expected.powi(-2));
+        spread.add(&ranges, missing, expected.powi(-2));
+    }
+    fn number(&mut self, _: i32, slot: usize, wanted: impl Fn(i32) -> i32) -> i32 {
+        wanted(self.source[slot])
+    }
+    fn send(&mut self, _: &Tables, _: &[u8], _: &[i32]) {}
+    fn new_points(&mut self) -> bool {
+        false
+    }
+    fn was_quiet(&mut self, _: bool) {}
 }
 
 /// The kernels of a level from its sampled diamonds: their blocks, before the new points, and sources.

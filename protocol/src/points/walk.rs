@@ -27,7 +27,7 @@ pub(super) fn steps(value: i32, step: i32) -> i32 {
 }
 
 /// `base + k * step`, if that is a height.
-pub(super) fn moved(base: i32, k: i32, step: i32) -> Result<i32, DecodeError> {
+fn moved(base: i32, k: i32, step: i32) -> Result<i32, DecodeError> {
     let height = i64::from(base) + i64::from(k) * i64::from(step);
     i32::try_from(height).ok().filter(|h| h.abs() <= HEIGHT_MAX).ok_or(DecodeError::Height)
 }
@@ -381,7 +381,7 @@ impl<'a> NewRows<'a> {
 }
 
 /// Heights are below 2^HEIGHT_BITS in magnitude.
-const HEIGHT_BITS: u32 = (HEIGHT_MAX as u32 + 1).trailing_zeros();
+pub(super) const HEIGHT_BITS: u32 = (HEIGHT_MAX as u32 + 1).trailing_zeros();
 
 /// Larger numbers make a neighbour no rougher.
 const NUMBER_MAX: u32 = 1000;

@@ -169,9 +169,9 @@ impl Build<'_> {
             // What the last level of the lattice draws, and those past it, is at the samples' own places: there
             // the diamonds compare themselves.
             let draws = level + 1 < forest.lattice_levels();
-            let mut surface =
-                draws.then(|| Surface::new(self.plan.spacing_log2(level + 1), corner, cells));
-            before = self.chunk_level(corner, level, diamonds, &before, surface.as_mut(), coarse, &mut chunk)?;
+            let mut surface = draws.then(|| Surface::new(self.plan.spacing_log2(level + 1), corner, cells));
+            before =
+                self.chunk_level(corner, level, diamonds, &before, surface.as_mut(), coarse, &mut chunk)?;
             if let Some(surface) = surface.filter(|_| !samples.is_empty()) {
                 measure(forest, level + 1, &samples, surface.nodes(), &mut found);
             }
