@@ -353,6 +353,7 @@ impl<'a> Around<'a> {
                 (w + e - s - n).abs() as f32,
                 ((w - e).abs() + (s - n).abs()) as f32,
                 (sw + ne - se - nw).abs() as f32,
+                ((ww + ee - w - e).abs() + (ss + nn - s - n).abs()) as f32,
             ],
         }
     }
@@ -377,21 +378,23 @@ impl Expect {
     #[inline(always)]
     fn class(&self, parts: &Parts) -> (u8, bool) {
         // In steps: the outer thirds begin at half a step.
-        const TILT: [f32; TILTS - 1] = [0.1, 0.25, 0.5, 0.8, 1.2, 2.0];
+        const TILT: [f32; TILTS - 1] = [0.06, 0.15, 0.3, 0.5, 0.75, 1.1, 1.6, 2.6];
         const LEAST: f32 = 0.0625;
-        const MOST: f32 = LEAST * (1 << (SPREADS - 1)) as f32;
+        const MOST: f32 = LEAST * (1 << (SPREADS / 2)) as f32 * 0.999;
         let mut tilt = 0.0;
         for (weight, part) in self.tilt.iter().zip(parts.tilt) {
             tilt += weight * part;
         }
-        let [a, b, c, d] = self.spread;
-        let spread = a * parts.spread[0] + b * parts.spread[1] + c * parts.spread[2] + d;
+        let mut spread = self.spread[SPREAD_PARTS - 1];
+        for (weight, part) in self.spread.iter().zip(parts.spread) {
+            spread += weight * part;
+        }
         let aside = tilt.abs();
         let tilted: u8 = TILT.iter().map(|limit| u8::from(aside >= *limit)).sum();
         // An octave a class.
         let spread = if spread > LEAST { spread } else { LEAST };
         let spread = if spread < MOST { spread } else { MOST };
-        let spread = ((spread.to_bits() >> 23) - (LEAST.to_bits() >> 23)) as u8;
+        let spread = ((spread.to_bits() >> 22) - (LEAST.to_bits() >> 22)) as u8;
         (FIRST_CORRECTION + spread * TILTS as u8 + tilted, tilt < 0.0)
     }
 }

@@ -30,9 +30,9 @@ const OCTAVES_BELOW: u32 = 8;
 /// Classes of corrections: how far to one side a point is expected, times how sure that is.
 pub const CORRECTION_CLASSES: usize = TILTS * SPREADS;
 /// Kinds of tilt: how far to one side.
-pub const TILTS: usize = 7;
+pub const TILTS: usize = 9;
 /// Kinds of spread: how sure.
-pub const SPREADS: usize = 9;
+pub const SPREADS: usize = 16;
 
 /// Hazards of a table.
 pub const HAZARDS: usize = 8;
@@ -116,12 +116,12 @@ pub const REFINER_PASSES: usize = 3;
 /// Parts of the place where a point is expected.
 pub const TILT_PARTS: usize = 10;
 /// Parts of how far off it may be; the last one is a constant.
-pub const SPREAD_PARTS: usize = 4;
+pub const SPREAD_PARTS: usize = 5;
 
 impl Default for Refiner {
     /// The mean of the four neighbours.
     fn default() -> Self {
-        Self { tilt: [1024, 1024, 1024, 0, 0, 0, 0, 0, 0, 0], spread: [600, 400, 200, 1200] }
+        Self { tilt: [1024, 1024, 1024, 0, 0, 0, 0, 0, 0, 0], spread: [600, 400, 200, 0, 1200] }
     }
 }
 

@@ -146,8 +146,8 @@ impl Pass for Corrector<'_> {
         let step = f64::from(step);
         let own = f64::from(self.source[slot] - here) / step;
         let places = parts.tilt.map(|d| f64::from(d) / step);
-        let [a, b, c] = parts.spread.map(|d| f64::from(d) / step);
-        let ranges = [a, b, c, 1.0];
+        let [a, b, c, d] = parts.spread.map(|d| f64::from(d) / step);
+        let ranges = [a, b, c, d, 1.0];
         let sum = |weights: &[f32], parts: &[f64]| {
             weights.iter().zip(parts).map(|(w, p)| f64::from(*w) * p).sum::<f64>()
         };
