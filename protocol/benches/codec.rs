@@ -23,19 +23,19 @@ fn height(x: u32, y: u32) -> i32 {
         f64::from((v ^ v >> 15) & 0xffff) / 65535.0
     };
     let mut sum = 0.0;
-    for octave in 0..8 {
+    for octave in 0..10 {
         let side = 512 >> octave;
         let (i, j) = (x / side, y / side);
         let fade = |t: f64| t * t * (3.0 - 2.0 * t);
         let (s, t) =
             (fade(f64::from(x % side) / f64::from(side)), fade(f64::from(y % side) / f64::from(side)));
         let row = |j: u32| corner(i, j, octave) * (1.0 - s) + corner(i + 1, j, octave) * s;
-        sum += (row(j) * (1.0 - t) + row(j + 1) * t) * 1250.0 / f64::from(1 << octave);
+        sum += (row(j) * (1.0 - t) + row(j + 1) * t) * 1250.0 / 1.75f64.powi(octave.cast_signed());
     }
     sum as i32
 }
 
-/// A diamond of the finest level with what its parents leave, its source and its payload.
+/// A diamond with what its parents leave, its source and its payload.
 struct Case {
     forest: Forest,
     coding: Coding,
@@ -45,18 +45,20 @@ struct Case {
     payload: Vec<u8>,
 }
 
-/// `coarse`: whether old points have a coarser step, so that each is corrected as well.
-fn case(fine_step: u32, coarse: bool) -> Case {
-    let forest = forest();
-    let exponents = if coarse { vec![4, 4, 3, 3, 2, 2, 1, 1, 0] } else { vec![0; 9] };
+/// Of the last level of the lattice, whose steps are fine; or of a level past it, the first being 1, whose
+/// points are corrected by one factor of three.
+fn case(fine_step: u32, past: u8) -> Case {
+    let forest = forest().with_precision(past).expect("few levels past the lattice");
+    let lattice = forest.lattice_levels();
+    let exponents = (0..=forest.levels()).map(|l| past - l.saturating_sub(lattice) as u8).collect();
     let coding = Coding::new(Rule::Smooth, fine_step, exponents).expect("falling exponents, odd step");
     let source_of = |d: Diamond| {
-        let mut block = Block::empty(&forest);
+        let mut block = Block::empty(&forest, d.level());
         block.fill(&forest.local(d), height);
         block
     };
     let inherited = |before: &HashMap<Diamond, Block>, d: Diamond| {
-        let mut block = Block::empty(&forest);
+        let mut block = Block::empty(&forest, d.level());
         for parent in forest.parents(d) {
             block.inherit(&forest, d, parent, &before[&parent]);
         }
@@ -83,20 +85,30 @@ fn case(fine_step: u32, coarse: bool) -> Case {
     Case { forest, coding, diamond, old, source, payload }
 }
 
+/// Points that the split of a case's diamond adds or corrects.
+fn points_of(case: &Case) -> u64 {
+    let (n, level) = (case.old.segments() as u64, case.diamond.level());
+    match (case.forest.adds_points(level), case.old.has_centres()) {
+        (true, _) => n * n,
+        (false, false) => (n - 1) * (n - 1),
+        (false, true) => (n - 1) * (n - 1) + n * n,
+    }
+}
+
 fn points(c: &mut Criterion) {
     let mut group = c.benchmark_group("points");
-    let new_points = forest().segments().pow(2) as u64;
-    group.throughput(Throughput::Elements(new_points));
     let cases = [
-        ("lossless", 1, false),
-        ("lossless_corrected", 1, true),
-        ("error_1_m", 3, false),
-        ("error_1_m_corrected", 3, true),
-        ("error_5_m", 11, false),
+        ("lossless", 1, 0),
+        ("error_1_m", 3, 0),
+        ("error_5_m", 11, 0),
+        ("4_m_to_1_m", 3, 1),
+        ("1_m_to_lossless", 1, 2),
     ];
-    for (name, fine_step, coarse) in cases {
-        let case = case(fine_step, coarse);
-        println!("{name}: {} bytes for {new_points} new points", case.payload.len());
+    for (name, fine_step, past) in cases {
+        let case = case(fine_step, past);
+        let points = points_of(&case);
+        group.throughput(Throughput::Elements(points));
+        println!("{name}: {} bytes for {points} points", case.payload.len());
         group.bench_function(format!("encode/{name}"), |b| {
             b.iter_batched_ref(
                 || case.old.clone(),

@@ -16,8 +16,10 @@
 //! | 0 | 4 a lane | states of the lanes, little-endian | 2^16.. |
 //! | 4 a lane | .. | words of 16 bits, little-endian | just as many as the symbols take |
 //!
-//! After the last symbol every state must be back at 2^16: a check of 16 bits a lane, besides that no word
-//! may be left.
+//! Two lanes begin, and so end for the receiver, at 2^16. A single one begins at 1, which costs no bits: until
+//! its state first outgrows 32 bits there are no words, and where that never happens the state is all there
+//! is, without its leading zero bytes. After the last symbol every state must be back at its beginning, and no
+//! word may be left.
 
 #![allow(
     clippy::cast_possible_truncation,
@@ -30,8 +32,13 @@ pub const PRECISION: u32 = 12;
 /// The sum of the probabilities of a table's symbols.
 pub const TOTAL: u32 = 1 << PRECISION;
 
-/// The least state.
+/// The least state while there are words.
 const LOWEST: u32 = 1 << 16;
+
+/// Where the states of so many lanes begin.
+fn beginning(lanes: usize) -> u32 {
+    if lanes == 1 { 1 } else { LOWEST }
+}
 
 /// The most bits that [`Encoder::plain`] takes at once.
 pub const PLAIN_MAX: u32 = 16;
@@ -106,7 +113,7 @@ impl Encoder {
         if self.steps.is_empty() {
             return Vec::new();
         }
-        let mut states = [LOWEST; 2];
+        let mut states = [beginning(lanes); 2];
         let mut words: Vec<u16> = Vec::with_capacity(self.steps.len());
         for step in self.steps.iter().rev() {
             let state = &mut states[usize::from(step.lane) % lanes];
@@ -118,6 +125,10 @@ impl Encoder {
                 *state >>= 16;
             }
             *state = ((*state / share) << precision) + *state % share + u32::from(step.start);
+        }
+        if lanes == 1 && words.is_empty() {
+            let zeros = states[0].leading_zeros() as usize / 8;
+            return states[0].to_le_bytes()[..4 - zeros].to_vec();
         }
         let mut bytes = Vec::with_capacity(4 * lanes + 2 * words.len());
         for state in &states[..lanes] {
@@ -142,8 +153,14 @@ impl<'a> Decoder<'a> {
     /// Over bytes with one lane or two; `None` where they cannot be whole.
     #[must_use]
     pub fn new(bytes: &'a [u8], lanes: usize) -> Option<Self> {
-        let mut states = [LOWEST; 2];
+        let mut states = [beginning(lanes); 2];
         let mut rest = bytes;
+        if let (1, 1..=4, Some(highest)) = (lanes, bytes.len(), bytes.last()) {
+            let mut state = [0; 4];
+            state[..bytes.len()].copy_from_slice(bytes);
+            states[0] = u32::from_le_bytes(state);
+            return (*highest > 0).then_some(Self { words: &[], next: 0, states, lanes });
+        }
         if !bytes.is_empty() {
             for state in &mut states[..lanes] {
                 let (head, tail) = rest.split_first_chunk::<4>()?;
@@ -152,8 +169,8 @@ impl<'a> Decoder<'a> {
             }
         }
         let (words, odd) = rest.as_chunks::<2>();
-        let sound = odd.is_empty() && states.iter().all(|s| *s >= LOWEST);
-        sound.then_some(Self { words, next: 0, states, lanes })
+        let is_whole = odd.is_empty() && states[..lanes].iter().all(|s| *s >= LOWEST);
+        is_whole.then_some(Self { words, next: 0, states, lanes })
     }
 
     /// How many lanes there are.
@@ -178,8 +195,9 @@ impl<'a> Decoder<'a> {
     /// Without a branch: whether a word is needed is as random as the data, and would be mispredicted.
     #[inline(always)]
     pub fn refill(&mut self, state: u32) -> u32 {
-        let word = self.words.get(self.next).map_or(0, |w| u32::from(u16::from_le_bytes(*w)));
-        let low = state < LOWEST;
+        let word = self.words.get(self.next);
+        let low = state < LOWEST && word.is_some();
+        let word = word.map_or(0, |w| u32::from(u16::from_le_bytes(*w)));
         self.next += usize::from(low);
         if low { state << 16 | word } else { state }
     }
@@ -204,7 +222,7 @@ impl<'a> Decoder<'a> {
     /// Whether the symbols so far are just those of the bytes.
     #[must_use]
     pub fn is_spent(&self) -> bool {
-        self.next == self.words.len() && self.states == [LOWEST; 2]
+        self.next == self.words.len() && self.states == [beginning(self.lanes); 2]
     }
 }
 
@@ -357,8 +375,18 @@ mod tests {
     fn nothing_takes_no_bytes_and_too_few_are_refused() {
         assert!(Encoder::default().finish(2).is_empty());
         assert!(Decoder::new(&[], 2).unwrap().is_spent());
-        assert!(Decoder::new(&[0, 0, 1], 1).is_none());
+        assert!(Decoder::new(&[0, 0, 1], 2).is_none());
         assert!(Decoder::new(&[0, 0, 1, 0, 7], 1).is_none(), "half a word");
-        assert!(Decoder::new(&[0, 0, 0, 0], 1).is_none(), "a state below the least");
+        assert!(Decoder::new(&[1, 0, 0, 0, 7, 7], 1).is_none(), "a state below the least");
+        assert!(Decoder::new(&[7, 0], 1).is_none(), "a zero byte that says nothing");
+    }
+
+    #[test]
+    fn few_symbols_take_few_bytes() {
+        let mut coder = Encoder::default();
+        for _ in 0..7 {
+            coder.symbol(0, 0, TOTAL as u16 / 2);
+        }
+        assert_eq!(coder.finish(1).len(), 1, "seven bits");
     }
 }

@@ -296,8 +296,9 @@ impl Raster {
 struct Thirds {
     runs: Vec<Third>,
     classes: Vec<u8>,
-    /// Whether a point is expected lower: towards that counts as up.
-    down: Vec<bool>,
+    /// How far up each point is expected, in steps: where that is downwards, down counts as up.
+    tilts: Vec<f32>,
+    spreads: Vec<f32>,
     numbers: Vec<i32>,
 }
 
@@ -341,21 +342,52 @@ impl<'a> Around<'a> {
         Self { here: line([0, 0]), near: NEAR.map(line), far: FAR.map(line) }
     }
 
+    /// The first `count` points.
     #[inline(always)]
-    fn parts(&self, i: usize) -> Parts {
-        let h = self.here[i];
-        let [w, e, s, n, sw, se, nw, ne] = self.near.map(|line| line[i] - h);
-        let [ww, ee, ss, nn, a, b, c, d, f, g, j, k] = self.far.map(|line| line[i] - h);
-        Parts {
-            tilt: [w + e, s, n, sw + se, nw + ne, ww + ee, ss, nn, a + b + c + d, f + g + j + k]
-                .map(|d| d as f32),
-            spread: [
-                (w + e - s - n).abs() as f32,
-                ((w - e).abs() + (s - n).abs()) as f32,
-                (sw + ne - se - nw).abs() as f32,
-                ((ww + ee - w - e).abs() + (ss + nn - s - n).abs()) as f32,
-            ],
+    fn cut(&self, count: usize) -> Self {
+        Self {
+            here: &self.here[..count],
+            near: std::array::from_fn(|i| &self.near[i][..count]),
+            far: std::array::from_fn(|i| &self.far[i][..count]),
         }
+    }
+
+    /// What the neighbours of point i lie higher, and what they differ among themselves.
+    #[inline(always)]
+    fn tilt(&self, i: usize) -> [f32; TILT_PARTS] {
+        let h = self.here[i];
+        let [w, e, s, n, sw, se, nw, ne] = self.near;
+        let [ww, ee, ss, nn, a, b, c, d, f, g, j, k] = self.far;
+        let (two, four) = (2 * h, 4 * h);
+        [
+            (w[i] + e[i] - two) as f32,
+            (s[i] - h) as f32,
+            (n[i] - h) as f32,
+            (sw[i] + se[i] - two) as f32,
+            (nw[i] + ne[i] - two) as f32,
+            (ww[i] + ee[i] - two) as f32,
+            (ss[i] - h) as f32,
+            (nn[i] - h) as f32,
+            (a[i] + b[i] + c[i] + d[i] - four) as f32,
+            (f[i] + g[i] + j[i] + k[i] - four) as f32,
+        ]
+    }
+
+    #[inline(always)]
+    fn spread(&self, i: usize) -> [f32; SPREAD_PARTS - 1] {
+        let [w, e, s, n, sw, se, nw, ne] = self.near;
+        let [ww, ee, ss, nn, ..] = self.far;
+        let (we, sn) = (w[i] + e[i], s[i] + n[i]);
+        [
+            (we - sn).abs() as f32,
+            ((w[i] - e[i]).abs() + (s[i] - n[i]).abs()) as f32,
+            (sw[i] + ne[i] - se[i] - nw[i]).abs() as f32,
+            ((ww[i] + ee[i] - we).abs() + (ss[i] + nn[i] - sn).abs()) as f32,
+        ]
+    }
+
+    fn parts(&self, i: usize) -> Parts {
+        Parts { tilt: self.tilt(i), spread: self.spread(i) }
     }
 }
 
@@ -374,28 +406,42 @@ impl Expect {
         Self { tilt: refiner.tilt().map(|w| w * per_step), spread }
     }
 
-    /// The class of a correction, and whether it is expected to be downwards.
-    #[inline(always)]
-    fn class(&self, parts: &Parts) -> (u8, bool) {
+    /// The classes of a run of corrections, and whether each is expected to be downwards. Loop by loop over
+    /// plain slices, so that each becomes one over vectors.
+    fn classes(&self, around: &Around<'_>, tilts: &mut [f32], spreads: &mut [f32], classes: &mut [u8]) {
         // In steps: the outer thirds begin at half a step.
         const TILT: [f32; TILTS - 1] = [0.06, 0.15, 0.3, 0.5, 0.75, 1.1, 1.6, 2.6];
+        // Two classes an octave.
         const LEAST: f32 = 0.0625;
         const MOST: f32 = LEAST * (1 << (SPREADS / 2)) as f32 * 0.999;
-        let mut tilt = 0.0;
-        for (weight, part) in self.tilt.iter().zip(parts.tilt) {
-            tilt += weight * part;
+        let count = classes.len();
+        let around = around.cut(count);
+        let (tilts, spreads) = (&mut tilts[..count], &mut spreads[..count]);
+        for (i, tilt) in tilts.iter_mut().enumerate() {
+            let mut sum = 0.0;
+            for (weight, part) in self.tilt.iter().zip(around.tilt(i)) {
+                sum += weight * part;
+            }
+            *tilt = sum;
         }
-        let mut spread = self.spread[SPREAD_PARTS - 1];
-        for (weight, part) in self.spread.iter().zip(parts.spread) {
-            spread += weight * part;
+        for (i, spread) in spreads.iter_mut().enumerate() {
+            let mut sum = self.spread[SPREAD_PARTS - 1];
+            for (weight, part) in self.spread.iter().zip(around.spread(i)) {
+                sum += weight * part;
+            }
+            *spread = sum;
         }
-        let aside = tilt.abs();
-        let tilted: u8 = TILT.iter().map(|limit| u8::from(aside >= *limit)).sum();
-        // An octave a class.
-        let spread = if spread > LEAST { spread } else { LEAST };
-        let spread = if spread < MOST { spread } else { MOST };
-        let spread = ((spread.to_bits() >> 22) - (LEAST.to_bits() >> 22)) as u8;
-        (FIRST_CORRECTION + spread * TILTS as u8 + tilted, tilt < 0.0)
+        for i in 0..count {
+            let aside = tilts[i].abs();
+            let mut tilted = 0;
+            for limit in TILT {
+                tilted += u32::from(aside >= limit);
+            }
+            let spread = if spreads[i] > LEAST { spreads[i] } else { LEAST };
+            let spread = if spread < MOST { spread } else { MOST };
+            let spread = (spread.to_bits() >> 22) - (LEAST.to_bits() >> 22);
+            classes[i] = (u32::from(FIRST_CORRECTION) + spread * TILTS as u32 + tilted) as u8;
+        }
     }
 }
 
@@ -423,19 +469,18 @@ impl Thirds {
     fn clear(&mut self) {
         self.runs.clear();
         self.classes.clear();
-        self.down.clear();
+        self.tilts.clear();
     }
 
     /// Adds every other of a run of points, each to be moved by a `step` or not at all.
     fn add(&mut self, raster: &Raster, place: [usize; 2], count: usize, step: i32, expect: &Expect) {
-        let around = Around::new(raster, place, count);
         let start = self.classes.len();
         self.classes.resize(start + count, 0);
-        self.down.resize(start + count, false);
-        let (classes, down) = (&mut self.classes[start..][..count], &mut self.down[start..][..count]);
-        for i in 0..count {
-            (classes[i], down[i]) = expect.class(&around.parts(i));
-        }
+        self.tilts.resize(start + count, 0.0);
+        self.spreads.resize(count, 0.0);
+        let around = Around::new(raster, place, count);
+        let tilts = &mut self.tilts[start..];
+        expect.classes(&around, tilts, &mut self.spreads, &mut self.classes[start..]);
         self.runs.push(Third { place, count, step });
         if raster.holes.is_empty() {
             return;
@@ -445,12 +490,12 @@ impl Thirds {
         let mut kept = start;
         for i in 0..count {
             if !raster.holes[raster.at(x + 2 * i, y)] {
-                (self.classes[kept], self.down[kept]) = (self.classes[start + i], self.down[start + i]);
+                (self.classes[kept], self.tilts[kept]) = (self.classes[start + i], self.tilts[start + i]);
                 kept += 1;
             }
         }
         self.classes.truncate(kept);
-        self.down.truncate(kept);
+        self.tilts.truncate(kept);
     }
 
     /// Moves the points by their numbers: those that were received, or those that the source asks for.
@@ -468,7 +513,7 @@ impl Thirds {
                     continue;
                 }
                 let base = raster.heights[first + i];
-                let turn = |k: i32| if self.down[next] { -k } else { k };
+                let turn = |k: i32| if self.tilts[next] < 0.0 { -k } else { k };
                 let wanted = |h: i32| turn(steps(h - base, step).clamp(-1, 1));
                 let number = pass.number(self.numbers[next], raster.slot(x + 2 * i, y), wanted);
                 self.numbers[next] = number;
