@@ -89,23 +89,26 @@ pub(super) fn walk_corrections<P: Pass>(
     let tables = coding.model().tables();
     let mut raster = Raster::of(block, upper, turned);
     let side = raster.side;
-    let mut thirds = Thirds::default();
+    let (mut thirds, mut row) = (Thirds::default(), Row::default());
     for (round, which) in (1..=rounds).rev().flat_map(|round| PASSES.map(|p| (round, p))) {
         let refiner = &refiners[which as usize];
         for y in 1..side - 1 {
             let Some(parity) = which.columns(y) else { continue };
-            thirds.clear();
             let (runs, count) = if turned { runs_turned(side, y, upper) } else { runs(side, y, upper) };
-            for Run { from, to, place } in runs.into_iter().take(count) {
+            let due = runs.into_iter().take(count).filter_map(|Run { from, to, place }| {
                 let at = PLACES.iter().position(|p| *p == place).unwrap_or(0);
                 let from = from + usize::from(from % 2 != parity);
                 if depths[at] < round || from >= to {
-                    continue;
+                    return None;
                 }
                 let step = coding.step(finest[at] + round - 1);
-                let count = (to - from).div_ceil(2);
-                thirds.add(&raster, [from, y], count, step, &Expect::new(refiner, step));
-            }
+                Some(Third { place: [from, y], count: (to - from).div_ceil(2), step })
+            });
+            let (Some(first), Some(last)) = (due.clone().next(), due.clone().last()) else { continue };
+            let span = (last.place[0] - first.place[0]) / 2 + last.count;
+            row.look(&raster, first.place, span, refiner);
+            thirds.clear();
+            due.for_each(|third| thirds.add(&raster, &row, third, refiner));
             if P::LEARNS {
                 for third in &thirds.runs {
                     third.learn(&raster, which as usize, pass);
@@ -296,9 +299,8 @@ impl Raster {
 struct Thirds {
     runs: Vec<Third>,
     classes: Vec<u8>,
-    /// How far up each point is expected, in steps: where that is downwards, down counts as up.
-    tilts: Vec<f32>,
-    spreads: Vec<f32>,
+    /// Whether a point is expected lower: towards that counts as up.
+    down: Vec<bool>,
     numbers: Vec<i32>,
 }
 
@@ -342,16 +344,6 @@ impl<'a> Around<'a> {
         Self { here: line([0, 0]), near: NEAR.map(line), far: FAR.map(line) }
     }
 
-    /// The first `count` points.
-    #[inline(always)]
-    fn cut(&self, count: usize) -> Self {
-        Self {
-            here: &self.here[..count],
-            near: std::array::from_fn(|i| &self.near[i][..count]),
-            far: std::array::from_fn(|i| &self.far[i][..count]),
-        }
-    }
-
     /// What the neighbours of point i lie higher, and what they differ among themselves.
     #[inline(always)]
     fn tilt(&self, i: usize) -> [f32; TILT_PARTS] {
@@ -391,56 +383,67 @@ impl<'a> Around<'a> {
     }
 }
 
-/// The weights of a level, for one step.
-#[derive(Debug, Clone, Copy)]
-struct Expect {
-    tilt: [f32; TILT_PARTS],
-    spread: [f32; SPREAD_PARTS],
+/// What is expected of every other point of a row, in quanta.
+#[derive(Debug, Default)]
+struct Row {
+    /// The column of the first.
+    from: usize,
+    /// How far up each is expected.
+    tilts: Vec<f32>,
+    /// How far off that may be, but for the constant.
+    spreads: Vec<f32>,
 }
 
-impl Expect {
-    fn new(refiner: &Refiner, step: i32) -> Self {
-        let per_step = 1.0 / step as f32;
-        let mut spread = refiner.spread().map(|w| w * per_step);
-        spread[SPREAD_PARTS - 1] = refiner.spread()[SPREAD_PARTS - 1];
-        Self { tilt: refiner.tilt().map(|w| w * per_step), spread }
+impl Row {
+    /// Looks at `count` points from `place` on. Loop by loop over plain slices, so that each becomes one over
+    /// vectors.
+    fn look(&mut self, raster: &Raster, place: [usize; 2], count: usize, refiner: &Refiner) {
+        self.from = place[0];
+        self.tilts.resize(count, 0.0);
+        self.spreads.resize(count, 0.0);
+        let around = Around::new(raster, place, count);
+        let (tilts, spreads) = (&mut self.tilts[..count], &mut self.spreads[..count]);
+        let weights = refiner.tilt();
+        for (i, tilt) in tilts.iter_mut().enumerate() {
+            let mut sum = 0.0;
+            for (weight, part) in weights.iter().zip(around.tilt(i)) {
+                sum += weight * part;
+            }
+            *tilt = sum;
+        }
+        let weights = refiner.spread();
+        for (i, spread) in spreads.iter_mut().enumerate() {
+            let mut sum = 0.0;
+            for (weight, part) in weights.iter().zip(around.spread(i)) {
+                sum += weight * part;
+            }
+            *spread = sum;
+        }
     }
 
-    /// The classes of a run of corrections, and whether each is expected to be downwards. Loop by loop over
-    /// plain slices, so that each becomes one over vectors.
-    fn classes(&self, around: &Around<'_>, tilts: &mut [f32], spreads: &mut [f32], classes: &mut [u8]) {
+    /// The classes of some of its points, the first of them in column `x`, by `step`.
+    fn classes(&self, x: usize, step: i32, refiner: &Refiner, classes: &mut [u8], down: &mut [bool]) {
         // In steps: the outer thirds begin at half a step.
         const TILT: [f32; TILTS - 1] = [0.06, 0.15, 0.3, 0.5, 0.75, 1.1, 1.6, 2.6];
         // Two classes an octave.
         const LEAST: f32 = 0.0625;
         const MOST: f32 = LEAST * (1 << (SPREADS / 2)) as f32 * 0.999;
-        let count = classes.len();
-        let around = around.cut(count);
-        let (tilts, spreads) = (&mut tilts[..count], &mut spreads[..count]);
-        for (i, tilt) in tilts.iter_mut().enumerate() {
-            let mut sum = 0.0;
-            for (weight, part) in self.tilt.iter().zip(around.tilt(i)) {
-                sum += weight * part;
-            }
-            *tilt = sum;
-        }
-        for (i, spread) in spreads.iter_mut().enumerate() {
-            let mut sum = self.spread[SPREAD_PARTS - 1];
-            for (weight, part) in self.spread.iter().zip(around.spread(i)) {
-                sum += weight * part;
-            }
-            *spread = sum;
-        }
+        let (count, at) = (classes.len(), (x - self.from) / 2);
+        let (tilts, spreads) = (&self.tilts[at..at + count], &self.spreads[at..at + count]);
+        let down = &mut down[..count];
+        let (per_step, constant) = (1.0 / step as f32, refiner.spread()[SPREAD_PARTS - 1]);
         for i in 0..count {
-            let aside = tilts[i].abs();
+            let aside = tilts[i].abs() * per_step;
             let mut tilted = 0;
             for limit in TILT {
                 tilted += u32::from(aside >= limit);
             }
-            let spread = if spreads[i] > LEAST { spreads[i] } else { LEAST };
+            let spread = spreads[i] * per_step + constant;
+            let spread = if spread > LEAST { spread } else { LEAST };
             let spread = if spread < MOST { spread } else { MOST };
             let spread = (spread.to_bits() >> 22) - (LEAST.to_bits() >> 22);
             classes[i] = (u32::from(FIRST_CORRECTION) + spread * TILTS as u32 + tilted) as u8;
+            down[i] = tilts[i] < 0.0;
         }
     }
 }
@@ -469,33 +472,30 @@ impl Thirds {
     fn clear(&mut self) {
         self.runs.clear();
         self.classes.clear();
-        self.tilts.clear();
+        self.down.clear();
     }
 
-    /// Adds every other of a run of points, each to be moved by a `step` or not at all.
-    fn add(&mut self, raster: &Raster, place: [usize; 2], count: usize, step: i32, expect: &Expect) {
+    /// Adds every other of a run of points of a row, each to be moved by the run's step or not at all.
+    fn add(&mut self, raster: &Raster, row: &Row, run: Third, refiner: &Refiner) {
+        let Third { place: [x, y], count, step } = run;
         let start = self.classes.len();
         self.classes.resize(start + count, 0);
-        self.tilts.resize(start + count, 0.0);
-        self.spreads.resize(count, 0.0);
-        let around = Around::new(raster, place, count);
-        let tilts = &mut self.tilts[start..];
-        expect.classes(&around, tilts, &mut self.spreads, &mut self.classes[start..]);
-        self.runs.push(Third { place, count, step });
+        self.down.resize(start + count, false);
+        row.classes(x, step, refiner, &mut self.classes[start..], &mut self.down[start..]);
+        self.runs.push(run);
         if raster.holes.is_empty() {
             return;
         }
         // Without height there is nothing to correct.
-        let [x, y] = place;
         let mut kept = start;
         for i in 0..count {
             if !raster.holes[raster.at(x + 2 * i, y)] {
-                (self.classes[kept], self.tilts[kept]) = (self.classes[start + i], self.tilts[start + i]);
+                (self.classes[kept], self.down[kept]) = (self.classes[start + i], self.down[start + i]);
                 kept += 1;
             }
         }
         self.classes.truncate(kept);
-        self.tilts.truncate(kept);
+        self.down.truncate(kept);
     }
 
     /// Moves the points by their numbers: those that were received, or those that the source asks for.
@@ -513,7 +513,7 @@ impl Thirds {
                     continue;
                 }
                 let base = raster.heights[first + i];
-                let turn = |k: i32| if self.tilts[next] < 0.0 { -k } else { k };
+                let turn = |k: i32| if self.down[next] { -k } else { k };
                 let wanted = |h: i32| turn(steps(h - base, step).clamp(-1, 1));
                 let number = pass.number(self.numbers[next], raster.slot(x + 2 * i, y), wanted);
                 self.numbers[next] = number;
