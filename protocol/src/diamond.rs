@@ -267,6 +267,11 @@ impl Block {
         &self.heights
     }
 
+    /// The same, to be changed.
+    pub fn heights_mut(&mut self) -> &mut [i32] {
+        &mut self.heights
+    }
+
     /// The old points, row v after row v, each of n+1 heights; and the centres, rows of n.
     pub fn parts_mut(&mut self) -> (&mut [i32], &mut [i32]) {
         self.heights.split_at_mut((self.n + 1) * (self.n + 1))

@@ -154,19 +154,21 @@ impl<'a> Decoder<'a> {
     #[must_use]
     pub fn new(bytes: &'a [u8], lanes: usize) -> Option<Self> {
         let mut states = [beginning(lanes); 2];
-        let mut rest = bytes;
-        if let (1, 1..=4, Some(highest)) = (lanes, bytes.len(), bytes.last()) {
-            let mut state = [0; 4];
-            state[..bytes.len()].copy_from_slice(bytes);
-            states[0] = u32::from_le_bytes(state);
-            return (*highest > 0).then_some(Self { words: &[], next: 0, states, lanes });
-        }
-        if !bytes.is_empty() {
-            for state in &mut states[..lanes] {
-                let (head, tail) = rest.split_first_chunk::<4>()?;
-                *state = u32::from_le_bytes(*head);
-                rest = tail;
+        match (lanes, bytes) {
+            (_, []) => return Some(Self { words: &[], next: 0, states, lanes }),
+            (1, [.., highest]) if bytes.len() <= 4 => {
+                let mut state = [0; 4];
+                state[..bytes.len()].copy_from_slice(bytes);
+                states[0] = u32::from_le_bytes(state);
+                return (*highest > 0).then_some(Self { words: &[], next: 0, states, lanes });
             }
+            _ => {}
+        }
+        let mut rest = bytes;
+        for state in &mut states[..lanes] {
+            let (head, tail) = rest.split_first_chunk::<4>()?;
+            *state = u32::from_le_bytes(*head);
+            rest = tail;
         }
         let (words, odd) = rest.as_chunks::<2>();
         let is_whole = odd.is_empty() && states[..lanes].iter().all(|s| *s >= LOWEST);
@@ -374,7 +376,7 @@ mod tests {
     #[test]
     fn nothing_takes_no_bytes_and_too_few_are_refused() {
         assert!(Encoder::default().finish(2).is_empty());
-        assert!(Decoder::new(&[], 2).unwrap().is_spent());
+        assert!((1..=2).all(|lanes| Decoder::new(&[], lanes).unwrap().is_spent()));
         assert!(Decoder::new(&[0, 0, 1], 2).is_none());
         assert!(Decoder::new(&[0, 0, 1, 0, 7], 1).is_none(), "half a word");
         assert!(Decoder::new(&[1, 0, 0, 0, 7, 7], 1).is_none(), "a state below the least");

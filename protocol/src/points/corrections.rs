@@ -185,6 +185,7 @@ struct Raster {
     /// Points along each side.
     side: usize,
     turned: bool,
+    upper: bool,
     /// Points that have no height, by position, if there are any.
     holes: Vec<bool>,
     stride: usize,
@@ -196,33 +197,23 @@ impl Raster {
         let n = block.segments();
         let side = if turned { 2 * n + 1 } else { n + 1 };
         let stride = (side + 2 * MARGIN).next_multiple_of(2);
-        let heights = vec![NODATA; stride * (side + 2 * MARGIN)];
-        let mut raster = Self { side, turned, holes: Vec::new(), stride, heights };
-        let (mut line, mut before) = (vec![NODATA; side], vec![0; side]);
+        let heights = vec![0; stride * (side + 2 * MARGIN)];
+        let mut raster = Self { side, turned, upper, holes: Vec::new(), stride, heights };
         for y in 0..side {
-            let (from, to) = raster.span(y, upper);
-            line.fill(NODATA);
-            for x in from..to {
-                line[x] = block.heights()[raster.slot(x, y)];
-            }
-            if line[from..to].contains(&NODATA) {
-                raster.holes.resize(raster.heights.len(), false);
-                for x in (from..to).filter(|x| line[*x] == NODATA) {
-                    let at = raster.at(x, y);
-                    raster.holes[at] = true;
+            let (from, to) = raster.span(y);
+            let mut is_whole = from < to;
+            for half in raster.halves(y) {
+                let points = raster.heights[half.at..half.at + half.count].iter_mut();
+                for (point, slot) in points.zip((half.slot..).step_by(half.step)) {
+                    *point = block.heights()[slot];
+                    is_whole &= *point != NODATA;
                 }
             }
-            if let Some(first) = line.iter().copied().find(|h| *h != NODATA) {
-                let mut last = first;
-                for height in &mut line {
-                    last = if *height == NODATA { last } else { *height };
-                    *height = last;
-                }
+            if is_whole {
+                raster.extend(y, from, to);
             } else {
-                line.copy_from_slice(&before);
+                raster.mend(y, from, to);
             }
-            raster.put(y + MARGIN, &line);
-            std::mem::swap(&mut line, &mut before);
         }
         for margin in 0..MARGIN {
             let (first, last) = (MARGIN * stride, (side + MARGIN - 1) * stride);
@@ -233,12 +224,73 @@ impl Raster {
     }
 
     /// The columns of a row that lie in the diamond.
-    fn span(&self, y: usize, upper: bool) -> (usize, usize) {
+    fn span(&self, y: usize) -> (usize, usize) {
         if !self.turned {
-            return (if upper { 0 } else { y }, self.side);
+            return (if self.upper { 0 } else { y }, self.side);
         }
         let m = self.side / 2;
-        if y > m && !upper { (0, 0) } else { (y.abs_diff(m), self.side - y.abs_diff(m)) }
+        if y > m && !self.upper { (0, 0) } else { (y.abs_diff(m), self.side - y.abs_diff(m)) }
+    }
+
+    /// The points of a row that lie in the diamond: every other from the first and from the second on.
+    fn halves(&self, y: usize) -> [Half; 2] {
+        let (from, to) = self.span(y);
+        // From one point to the next but one of a turned row, both local coordinates grow by one.
+        let m = self.side / 2;
+        [from, from + 1].map(|x| {
+            if x >= to {
+                return Half { at: 0, count: 0, slot: 0, step: 1 };
+            }
+            let slot = self.slot(x, y);
+            let is_old = slot < (m + 1) * (m + 1);
+            let step = if !self.turned { 2 } else { m + 1 + usize::from(is_old) };
+            Half { at: self.at(x, y), count: (to - x).div_ceil(2), slot, step }
+        })
+    }
+
+    /// Beyond the ends of the points of a row it goes on with them.
+    fn extend(&mut self, y: usize, from: usize, to: usize) {
+        let (first, last) = (self.heights[self.at(from, y)], self.heights[self.at(to - 1, y)]);
+        let row = (y + MARGIN) * self.stride;
+        for half in [row, row + self.stride / 2] {
+            let odd = usize::from(half > row);
+            // The first column of this half at or beyond each end, margin included.
+            let [low, high] = [from, to].map(|x| (x + MARGIN + 1 - odd) / 2);
+            self.heights[half..half + low].fill(first);
+            self.heights[half + high..half + self.stride / 2].fill(last);
+        }
+    }
+
+    /// Notes the holes of a row and fills them: with what lies to the west, or else to the east, or else in the
+    /// row before.
+    fn mend(&mut self, y: usize, from: usize, to: usize) {
+        self.holes.resize(self.heights.len(), false);
+        let mut last = None;
+        for x in from..to {
+            let at = self.at(x, y);
+            if self.heights[at] != NODATA {
+                last = Some(self.heights[at]);
+                continue;
+            }
+            self.holes[at] = true;
+            if let Some(last) = last {
+                self.heights[at] = last;
+            }
+        }
+        if last.is_none() {
+            let row = (y + MARGIN) * self.stride;
+            self.heights.copy_within(row - self.stride..row, row);
+            return;
+        }
+        let first = (from..to).map(|x| self.heights[self.at(x, y)]).find(|h| *h != NODATA).unwrap_or(0);
+        for x in from..to {
+            let at = self.at(x, y);
+            if self.heights[at] != NODATA {
+                break;
+            }
+            self.heights[at] = first;
+        }
+        self.extend(y, from, to);
     }
 
     /// Where the block has a point of the diamond.
@@ -249,16 +301,6 @@ impl Raster {
         }
         let m = self.side / 2;
         Block::slot(m, x + m - y, x + y - m)
-    }
-
-    /// Writes a row, margins included.
-    fn put(&mut self, row: usize, line: &[i32]) {
-        let (even, odd) = self.heights[row * self.stride..][..self.stride].split_at_mut(self.stride / 2);
-        let last = line.len() - 1;
-        let column = |x: usize| line[x.saturating_sub(MARGIN).min(last)];
-        for (i, (even, odd)) in even.iter_mut().zip(odd).enumerate() {
-            (*even, *odd) = (column(2 * i), column(2 * i + 1));
-        }
     }
 
     /// The position of a point.
@@ -278,20 +320,33 @@ impl Raster {
     }
 
     fn give_back(&self, block: &mut Block) {
-        let old_count = block.parts().0.len();
-        let (old, centres) = block.parts_mut();
-        for y in 0..self.side {
-            let (from, to) = self.span(y, true);
-            for x in from..to {
-                let (slot, height) = (self.slot(x, y), self.heights[self.at(x, y)]);
-                let point = if slot < old_count { &mut old[slot] } else { &mut centres[slot - old_count] };
-                // What has no height keeps none, and so does the half that is outside of the forest.
-                if *point != NODATA {
-                    *point = height;
+        let heights = block.heights_mut();
+        for half in (0..self.side).flat_map(|y| self.halves(y)) {
+            let points = &self.heights[half.at..half.at + half.count];
+            if self.holes.is_empty() {
+                for (point, slot) in points.iter().zip((half.slot..).step_by(half.step)) {
+                    heights[slot] = *point;
+                }
+                continue;
+            }
+            let is_hole = &self.holes[half.at..half.at + half.count];
+            for (i, slot) in (0..half.count).zip((half.slot..).step_by(half.step)) {
+                if !is_hole[i] {
+                    heights[slot] = points[i];
                 }
             }
         }
     }
+}
+
+/// Every other point of a row: where the raster has the first of `count`, one after the other, and where the
+/// block has them, `step` slots apart.
+#[derive(Debug, Clone, Copy)]
+struct Half {
+    at: usize,
+    count: usize,
+    slot: usize,
+    step: usize,
 }
 
 /// A row's worth of corrections by a third, in the order of the row.
