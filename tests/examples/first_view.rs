@@ -60,6 +60,9 @@ struct Arguments {
     /// Requests in flight at once
     #[arg(long, default_value_t = fetch::Options::default().requests_max)]
     requests: usize,
+    /// Memory for surfaces, in MiB
+    #[arg(long, default_value_t = terrain::Options::default().memory_bytes >> 20)]
+    memory: usize,
     /// How often each is measured; the table has the middle one by the seconds to the asked error
     #[arg(long, default_value_t = 3)]
     times: usize,
@@ -184,8 +187,12 @@ fn one(
     // A link of its own, so that nothing is under way, nor any connection open.
     let link = Link::start(address, shape)?;
     let fetch = fetch::Options { requests_max: arguments.requests, ..fetch::Options::default() };
-    let options =
-        terrain::Options { tolerance_pixels: arguments.error_pixels, fetch, ..terrain::Options::default() };
+    let options = terrain::Options {
+        tolerance_pixels: arguments.error_pixels,
+        memory_bytes: arguments.memory.saturating_mul(1 << 20),
+        fetch,
+        ..terrain::Options::default()
+    };
     let pause = Duration::from_secs_f64(1.0 / arguments.frames);
     let how = Watch { options, streamed, pause, patience: Duration::from_secs(120) };
     let url = format!("{}/scenes/{}", link.address, store.scene().name);
