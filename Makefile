@@ -2,7 +2,7 @@
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .NOTPARALLEL:
-.PHONY: help demo test check bench bench-peers setup fmt clippy tests doc deny wasm scripts
+.PHONY: help demo test check bench bench-link bench-peers bench-wasm setup fmt clippy tests doc deny wasm scripts
 
 # Mesa's device selection complains where there is no desktop session; there is nothing to select.
 export NODEVICE_SELECT := 1
@@ -15,6 +15,8 @@ help:
 	@echo "make test    everything that CI runs"
 	@echo "make check   formatting and lints only"
 	@echo "make bench   benchmarks, with a table at the end"
+	@echo "make bench-link    seconds to a view over slow links, on the DEMs of DIAMANTINA_DATA"
+	@echo "make bench-wasm    decoding in the browser's architecture, where it and node are installed"
 	@echo "make bench-peers   bytes, bounds and speed beside other codecs, on the DEMs of DIAMANTINA_DATA"
 
 demo:
@@ -30,6 +32,13 @@ bench:
 	@$(step) setup scripts/setup demo
 	@scripts/bench
 	@echo "Beside other codecs: make bench-peers (first run: an hour and more)"
+
+bench-link:
+	@$(step) setup scripts/setup demo
+	@$(step) link scripts/bench-link
+
+bench-wasm:
+	@$(step) wasm scripts/bench-wasm
 
 bench-peers:
 	@$(step) setup scripts/setup demo
@@ -60,4 +69,4 @@ wasm:
 	@$(step) wasm scripts/wasm
 
 scripts:
-	@$(step) scripts shellcheck .ci/run scripts/bench scripts/bench-peers scripts/deny scripts/setup scripts/step scripts/wasm
+	@$(step) scripts shellcheck .ci/run scripts/bench scripts/bench-link scripts/bench-peers scripts/bench-wasm scripts/deny scripts/setup scripts/step scripts/wasm scripts/wasm-cargo

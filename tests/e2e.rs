@@ -9,12 +9,16 @@
 
 /// The same input gives the same bytes, whatever the threads and the memory.
 mod determinism;
+/// The first view over a slow link: how soon, and never worse while the eye stands still.
+mod first_view;
 /// Heights asked for: every sample, and places between.
 mod heights;
 /// Wrong uses, broken files and sudden ends, through the real programs: exit codes, words, what survives.
 mod hostile;
 /// What the server answers to whom: routes, caches, refusals, heights.
 mod http;
+/// A slow and distant link, and that it is as slow and distant as asked.
+mod link;
 /// Progressive streams: what any prefix is worth, who may ask for what, and the client that draws from one.
 mod progressive;
 /// Law 7: a build that was killed, stopped or ran out of disk goes on; the bytes are those of an unbroken one.

@@ -232,7 +232,7 @@ fn every_prefix_is_within_the_error_that_it_declares_of_every_sample() {
                 let Subject::Diamond(d) = frame.subject else { continue };
                 // Decoded from what came before, and held at once to what the pages so far declare: each
                 // triangle that this split adds is drawn until its own diamond comes.
-                let mut block = Block::empty(&forest);
+                let mut block = Block::empty(&forest, d.level());
                 for parent in forest.parents(d) {
                     block.inherit(&forest, d, parent, &blocks[&parent]);
                 }
@@ -267,7 +267,7 @@ fn every_prefix_covers_the_forest_once_without_cracks() {
         camera: &camera,
         exaggeration: 1.0,
         tolerance_pixels: 1e-9,
-        splits_max: usize::MAX,
+        memory_bytes: usize::MAX,
     };
     let ideal = cut::choose(&ask, |d| Some(entries[&d]));
     for question in questions(&layer) {
@@ -472,18 +472,25 @@ fn a_damaged_store_cuts_the_answer_off_where_it_is_damaged() {
 fn surface(layer: &Layer, split: &[Diamond], blocks: &HashMap<Diamond, Block>) -> Vec<f64> {
     let [width, height] = layer.samples.map(i64::from);
     let mut values = vec![f64::NAN; (width * height) as usize];
-    let (n, forest) = (layer.forest.segments() as i64, layer.forest);
     for d in split {
-        let (local, block) = (forest.local(*d), &blocks[d]);
+        let (local, block) = (layer.forest.local(*d), &blocks[d]);
+        let n = block.segments() as i64;
         let height_at = |p: [i64; 2]| block.heights()[Block::slot(n as usize, p[0] as usize, p[1] as usize)];
-        // Cells of old points, each cut into four by its new one; coarse diamonds first, so that finer ones
-        // overwrite what they split.
+        // Cells of old points, each cut into four by its centre, or in two where that is no point; coarse
+        // diamonds first, so that finer ones overwrite what they split.
         for v in 0..n {
             for u in 0..n {
                 let ring = [[2 * u, 2 * v], [2 * u + 2, 2 * v], [2 * u + 2, 2 * v + 2], [2 * u, 2 * v + 2]];
                 let m = [2 * u + 1, 2 * v + 1];
-                for i in 0..4 {
-                    let corners = [ring[i], ring[(i + 1) % 4], m];
+                let rising = (u + v) % 2 == 0;
+                let triangles: Vec<[[i64; 2]; 3]> = if block.has_centres() {
+                    (0..4).map(|i| [ring[i], ring[(i + 1) % 4], m]).collect()
+                } else if rising {
+                    vec![[ring[0], ring[1], ring[2]], [ring[0], ring[2], ring[3]]]
+                } else {
+                    vec![[ring[0], ring[1], ring[3]], [ring[1], ring[2], ring[3]]]
+                };
+                for corners in triangles {
                     if !local.upper && corners.iter().any(|[p, q]| q > p) {
                         continue;
                     }
@@ -547,7 +554,7 @@ fn the_curve_tells_what_a_painter_finds_and_never_more_than_is_declared() {
             reader.take(&frame.bytes);
             bytes += frame.bytes.len() as u64;
             let Subject::Diamond(d) = frame.subject else { continue };
-            let mut block = Block::empty(&layer.forest);
+            let mut block = Block::empty(&layer.forest, d.level());
             for parent in layer.forest.parents(d) {
                 block.inherit(&layer.forest, d, parent, &blocks[&parent]);
             }

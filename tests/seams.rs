@@ -70,26 +70,28 @@ type Points = Vec<[i64; 2]>;
 /// Each edge of the drawn triangles, with the heights that each of its triangles has along it, and the sum
 /// of the doubled areas.
 fn edges(layer: &Layer, items: &[DrawItem]) -> (HashMap<Points, Vec<Vec<i32>>>, i64) {
-    let n = layer.forest.segments();
-    let m = 2 * n as i64;
-    let corners = [[0, 0], [m, 0], [m, m], [0, m]];
     let mut edges: HashMap<Points, Vec<Vec<i32>>> = HashMap::new();
     let mut area = 0;
     for item in items {
-        let local = layer.forest.local(item.diamond);
+        let (local, block) = (layer.forest.local(item.diamond), item.surface.block());
+        let n = block.segments();
+        // Where centres are no points, half of a diagonal has half as many segments.
+        let inner = if block.has_centres() { n } else { n / 2 };
+        let m = 2 * n as i64;
+        let corners = [[0, 0], [m, 0], [m, m], [0, m]];
         for side in (0..4).filter(|side| item.sides & 1 << side != 0) {
             let (a, b, centre) = (corners[side], corners[(side + 1) % 4], [m / 2, m / 2]);
             let [la, lb, lc] = [a, b, centre].map(|p| local.lattice2(p));
             area += ((lb[0] - la[0]) * (lc[1] - la[1]) - (lb[1] - la[1]) * (lc[0] - la[0])).abs();
-            for (from, to) in [(a, b), (b, centre), (centre, a)] {
-                let mut edge: Vec<([i64; 2], i32)> = (0..=n as i64)
+            for (from, to, count) in [(a, b, n), (b, centre, inner), (centre, a, inner)] {
+                let mut edge: Vec<([i64; 2], i32)> = (0..=count as i64)
                     .map(|i| {
-                        let p = [0, 1].map(|k| from[k] + (to[k] - from[k]) * i / n as i64);
+                        let p = [0, 1].map(|k| from[k] + (to[k] - from[k]) * i / count as i64);
                         let slot = Block::slot(n, p[0] as usize, p[1] as usize);
-                        (local.lattice2(p), item.surface.block().heights()[slot])
+                        (local.lattice2(p), block.heights()[slot])
                     })
                     .collect();
-                if edge[0].0 > edge[n].0 {
+                if edge[0].0 > edge[count].0 {
                     edge.reverse();
                 }
                 let (points, heights) = edge.into_iter().unzip();
@@ -140,6 +142,7 @@ fn any_cut_of_a_built_store_with_anything_missing_has_no_cracks() {
         // Saturation reaches a root square's width beyond the last height, so the fourth is the first empty one.
         let roots: Vec<Entry> = forest.root_diamonds().map(|root| entries[&root]).collect();
         assert!(roots.iter().any(Entry::is_empty), "an empty root: {roots:?}");
+        let largest = Surface::bytes(&forest, 0);
         let [low, high] = [layer.position([0, 0]), layer.position(layer.samples)];
         for round in 0..60 {
             // An eye somewhere above that sees everything, so that nothing is clipped.
@@ -152,7 +155,7 @@ fn any_cut_of_a_built_store_with_anything_missing_has_no_cracks() {
                 camera: &camera,
                 exaggeration: 1.0,
                 tolerance_pixels: 0.005 * 300f64.powf(dice.roll()),
-                splits_max: if round % 7 == 6 { 40 } else { usize::MAX },
+                memory_bytes: if round % 7 == 6 { 40 * largest } else { usize::MAX },
             };
             let ideal = cut::choose(&ask, |d| Some(entries[&d]));
             let arrived = if round % 5 == 0 { 1.0 } else { 0.6 + 0.4 * dice.roll() };
@@ -181,7 +184,7 @@ fn any_cut_of_a_built_store_with_anything_missing_has_no_cracks() {
                 .collect();
             for d in &drawn {
                 let local = forest.local(*d);
-                let n = forest.segments() as i64;
+                let n = forest.segments_at(d.level()) as i64;
                 let quarter = (local.u[0] * local.v[1] - local.u[1] * local.v[0]).abs() * n * n / 2;
                 let empty = forest.children(*d).into_iter().flatten().filter(|c| entries[c].is_empty());
                 void += quarter * empty.count() as i64;

@@ -93,7 +93,9 @@ impl Check<'_> {
     /// All that the split of a diamond draws: up to four triangles of the next level.
     pub(crate) fn split(&self, d: Diamond, block: &Block) {
         let local = self.forest.local(d);
-        let n = self.forest.segments() as i64;
+        let n = block.segments() as i64;
+        // Each has n^2 small ones, or half as many where centres are no points.
+        let depth = 2 * block.segments().ilog2() - u32::from(!block.has_centres());
         let children = self.forest.children(d);
         let corners = [[0, 0], [2 * n, 0], [2 * n, 2 * n], [0, 2 * n]];
         for side in 0..if local.upper { 4 } else { 2 } {
@@ -105,12 +107,12 @@ impl Check<'_> {
             assert_eq!(children[side].is_none(), d.level() + 1 == self.forest.levels());
             let [a, b, c] =
                 [corners[side], corners[(side + 1) % 4], [n, n]].map(|p| self.corner(&local, block, p));
-            self.bisect(d, &local, block, &declared, [a, b, c], 2 * self.forest.patch_log2());
+            self.bisect(d, &local, block, &declared, [a, b, c], depth);
         }
     }
 
     fn corner(&self, local: &Local, block: &Block, at: [i64; 2]) -> Corner {
-        let slot = Block::slot(self.forest.segments(), at[0] as usize, at[1] as usize);
+        let slot = Block::slot(block.segments(), at[0] as usize, at[1] as usize);
         Corner { local: at, lattice: local.lattice2(at), height: block.heights()[slot] }
     }
 

@@ -64,7 +64,7 @@ const FAILURES_MAX: usize = 4 * WISHES_MAX;
 /// How to fetch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Options {
-    /// Requests in flight at once, 1 to 64.
+    /// Requests in flight at once, 1 to 64; of them, half at most are for diamonds.
     pub requests_max: usize,
     /// How long a connection may be silent before the request is given up.
     pub patience: Duration,
@@ -72,7 +72,7 @@ pub struct Options {
 
 impl Default for Options {
     fn default() -> Self {
-        Self { requests_max: 4, patience: Duration::from_secs(15) }
+        Self { requests_max: 8, patience: Duration::from_secs(15) }
     }
 }
 

@@ -138,6 +138,10 @@ impl Shared {
         let stream = state.streams.pop_front();
         let resting: Vec<bool> = (0..self.scene.layers.len()).map(|layer| state.rests(layer)).collect();
         let wishes = if stream.is_none() { state.wishes.as_slice() } else { &[] };
+        // Batches share the line, so each further one delays those that are more urgent: half of the tasks keep it
+        // busy. Pages are small, and it is their round trips that cost.
+        let batches = state.flights.values().filter(|f| !f.is_page && f.stream.is_none()).count();
+        let may_batch = batches < self.requests_max.div_ceil(2);
         for want in wishes {
             let (Key::Page(layer, _) | Key::Diamond(layer, _)) = want.key;
             if resting[layer]
@@ -154,6 +158,7 @@ impl Shared {
                 Key::Page(layer, number) => {
                     page.get_or_insert((layer, number, batch.is_none()));
                 }
+                Key::Diamond(..) if !may_batch => {}
                 Key::Diamond(layer, d) => {
                     let batch = batch.get_or_insert_with(|| Batch::new(&self.http.base, &self.scene, layer));
                     if batch.layer == layer && !batch.push(d, want.bytes) {

@@ -65,6 +65,32 @@ fn requests_that_nobody_wants_any_more_are_dropped() {
 }
 
 #[test]
+fn of_eight_requests_half_may_be_for_diamonds_and_one_is() {
+    // More than this forest has: the server will be silent anyway.
+    let pages: Vec<Want> = (0..8).map(|page| Want { key: Key::Page(0, page), bytes: None }).collect();
+    // Each said to fill a batch.
+    let diamonds: Vec<Want> =
+        wants(9).into_iter().map(|want| Want { bytes: Some(BATCH_BYTES as u32), ..want }).collect();
+    assert!(diamonds.len() >= 8);
+    for (wishes, batches) in
+        [([diamonds.clone(), pages.clone()].concat(), 4), ([pages, diamonds].concat(), 1)]
+    {
+        // Silent, so that what was sent stays in flight.
+        let served = Served::start(1, Faults::default());
+        let (mut fetcher, _) = Fetcher::open(&served.url, Options::default()).unwrap();
+        served.misbehave(Faults { silent: 1.0, ..Faults::default() });
+        fetcher.wish(wishes);
+        let until = Instant::now() + Duration::from_secs(20);
+        while fetcher.shared.lock().flights.len() < 8 && Instant::now() < until {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let state = fetcher.shared.lock();
+        let flying = state.flying.keys().filter(|key| matches!(key, Key::Diamond(..))).count();
+        assert_eq!((state.flights.len(), flying), (8, batches));
+    }
+}
+
+#[test]
 fn batches_stay_within_their_limits() {
     let served = Served::start(1, Faults::default());
     let (mut fetcher, _) = Fetcher::open(&served.url, Options::default()).unwrap();

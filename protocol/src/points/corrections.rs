@@ -104,7 +104,7 @@ pub(super) fn walk_corrections<P: Pass>(
                 let step = coding.step(finest[at] + round - 1);
                 Some(Third { place: [from, y], count: (to - from).div_ceil(2), step })
             });
-            let (Some(first), Some(last)) = (due.clone().next(), due.clone().last()) else { continue };
+            let (Some(first), Some(last)) = (due.clone().next(), due.clone().next_back()) else { continue };
             let span = (last.place[0] - first.place[0]) / 2 + last.count;
             row.look(&raster, first.place, span, refiner);
             thirds.clear();

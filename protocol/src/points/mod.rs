@@ -142,9 +142,9 @@ pub fn encode(forest: &Forest, coding: &Coding, d: Diamond, block: &mut Block, s
         let (old, new) = source.parts();
         all_valid = !root || !old.contains(&NODATA);
         for (v, row) in new.chunks_exact(n).enumerate() {
-            for u in if upper { 0 } else { v }..n {
-                all_valid &= row[u] != NODATA;
-                as_inferred &= is_inferred(old, n, upper, u, v) == (row[u] != NODATA);
+            for (u, point) in row.iter().enumerate().skip(if upper { 0 } else { v }) {
+                all_valid &= *point != NODATA;
+                as_inferred &= is_inferred(old, n, upper, u, v) == (*point != NODATA);
             }
         }
     }

@@ -221,8 +221,9 @@ pub(super) fn walk_new<P: Pass>(
         Known::Sent => walk_validity(old, new, n, local.upper, pass),
         Known::Inferred => {
             for (v, row) in new.chunks_exact_mut(n).enumerate() {
-                for u in if local.upper { 0 } else { v }..n {
-                    row[u] = if is_inferred(old, n, local.upper, u, v) { 0 } else { NODATA };
+                let first = if local.upper { 0 } else { v };
+                for (u, point) in row.iter_mut().enumerate().skip(first) {
+                    *point = if is_inferred(old, n, local.upper, u, v) { 0 } else { NODATA };
                 }
             }
         }

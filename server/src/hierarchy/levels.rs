@@ -171,7 +171,7 @@ impl Build<'_> {
             let draws = level + 1 < forest.lattice_levels();
             let mut surface = draws.then(|| Surface::new(self.plan.spacing_log2(level + 1), corner, cells));
             before =
-                self.chunk_level(corner, level, diamonds, &before, surface.as_mut(), coarse, &mut chunk)?;
+                self.chunk_level((corner, level), diamonds, &before, surface.as_mut(), coarse, &mut chunk)?;
             if let Some(surface) = surface.filter(|_| !samples.is_empty()) {
                 measure(forest, level + 1, &samples, surface.nodes(), &mut found);
             }
@@ -181,11 +181,10 @@ impl Build<'_> {
     }
 
     /// Codes the diamonds of one level of a chunk, those that it owns for good, and draws all, if there is
-    /// something to draw to. Their blocks.
+    /// something to draw to. Their blocks. The chunk is given by its corner.
     fn chunk_level(
         &self,
-        corner: [u32; 2],
-        level: u32,
+        (corner, level): ([u32; 2], u32),
         diamonds: &BTreeSet<Diamond>,
         before: &HashMap<Diamond, Block>,
         mut surface: Option<&mut Surface>,
