@@ -4,6 +4,7 @@
 use crate::determinism::files;
 use crate::world::{Dice, World, programs, write_raw};
 use diamantina_server::sample;
+use diamantina_server::store::FORMAT;
 use diamantina_server::store::Store;
 use std::ffi::OsString;
 use std::io::Read;
@@ -338,20 +339,22 @@ fn what_is_no_store_is_refused() {
     std::fs::create_dir(folder.join("bare")).unwrap();
     let scene = std::fs::read_to_string(folder.join("store/scene.json")).unwrap();
     std::fs::create_dir(folder.join("newer")).unwrap();
-    std::fs::write(folder.join("newer/scene.json"), scene.replacen("\"format\": 2", "\"format\": 3", 1))
-        .unwrap();
+    let format = |number: u32| format!("\"format\": {number}");
+    let newer = scene.replacen(&format(FORMAT), &format(FORMAT + 1), 1);
+    std::fs::write(folder.join("newer/scene.json"), newer).unwrap();
     std::fs::create_dir(folder.join("text")).unwrap();
     std::fs::write(folder.join("text/scene.json"), "not JSON").unwrap();
     std::fs::create_dir(folder.join("alone")).unwrap();
     std::fs::write(folder.join("alone/scene.json"), &scene).unwrap();
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let port = taken.local_addr().unwrap().port();
+    let newer_format = format!("format {}", FORMAT + 1);
     for command in ["inspect", "inspect --verify", "inspect --json", "serve --listen 127.0.0.1:0"] {
         for (store, wanted) in [
             ("bare", ["bare", "not a store", "diamantina-server build"]),
             ("nowhere", ["nowhere", "not a store", "diamantina-server build"]),
             ("dem.tif", ["dem.tif", "not a store", "diamantina-server build"]),
-            ("newer", ["newer", "format 3", "build it again"]),
+            ("newer", ["newer", newer_format.as_str(), "build it again"]),
             ("text", ["text", "not JSON", "build the store again"]),
             ("alone", ["alone", "directory", "cannot read"]),
         ] {

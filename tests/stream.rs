@@ -137,7 +137,7 @@ fn steep_flight(scene: &diamantina_protocol::message::Scene) -> FlightPath {
 fn fly_over_magenta(world: &World, faults: Faults, seed: u64) -> (usize, Vec<f64>) {
     let proxy = Proxy::start(&world.served.address, faults, seed);
     let fetch = diamantina_client::fetch::Options::default();
-    let options = terrain::Options { tolerance_pixels: 0.5, fetch, ..terrain::Options::default() };
+    let options = terrain::Options { tolerance_pixels: 0.2, fetch, ..terrain::Options::default() };
     let mut terrain = Terrain::open(&format!("{}/scenes/world", proxy.address), options).unwrap();
     let path = steep_flight(terrain.scene());
     let flight = Flight { frames: 300, frames_a_second: 30.0, size: [160, 120], pictures: None };
@@ -164,7 +164,7 @@ fn fly_over_magenta(world: &World, faults: Faults, seed: u64) -> (usize, Vec<f64
 #[test]
 fn over_magenta_no_pixel_is_magenta_while_data_come_late_and_out_of_order() {
     let world = World::whole(1025);
-    let faults = Faults { delay: Duration::from_millis(250), cut: 0.3, ..Faults::default() };
+    let faults = Faults { delay: Duration::from_millis(250), cut: 0.5, ..Faults::default() };
     let (unfinished, _) = fly_over_magenta(&world, faults, 1);
     assert!(unfinished > 30, "the network was too fast: {unfinished} unfinished frames");
 }

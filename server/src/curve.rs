@@ -101,8 +101,9 @@ pub fn curve(store: &Arc<Store>, number: u8, layer: &Layer) -> Result<Vec<Row>, 
         bytes += frame.bytes.len() as u64;
         let Subject::Diamond(d) = frame.subject else { continue };
         let error = f64::from(entries.get(&d).map_or(0.0, |e| e.error_metres)).max(finest);
-        // What comes next is the worst of what is drawn; nothing is before the last root.
-        if d.level() > 0 && error < declared {
+        // What comes next is the worst of what is drawn; nothing is before the last root. Once all is within the
+        // finest error, what is left still makes the surface more precise: the last row tells of that.
+        if d.level() > 0 && error < declared && error > finest {
             declared = error;
             rows.push(sum.row(layer, bytes_here, diamonds, declared));
         }

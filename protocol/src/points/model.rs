@@ -155,7 +155,8 @@ pub struct Model {
 #[derive(Clone, Serialize, Deserialize)]
 struct ModelParts {
     levels: Vec<[Kernel; 2]>,
-    refiners: Vec<[Refiner; REFINER_PASSES]>,
+    /// None where nothing was learnt.
+    refiners: Vec<Option<[Refiner; REFINER_PASSES]>>,
     numbers: Vec<[u16; HAZARDS]>,
     corrections: Vec<[u16; 2]>,
 }
@@ -196,14 +197,17 @@ impl TryFrom<ModelParts> for Model {
         if let Some(bad) = all.copied().find(|h| !(1..TOTAL as u16).contains(h)) {
             return Err(ModelError::Hazard(bad));
         }
-        Ok(Self::new(p.levels, p.refiners, numbers, corrections))
+        let refiners = p.refiners.into_iter().map(Option::unwrap_or_default).collect();
+        Ok(Self::new(p.levels, refiners, numbers, corrections))
     }
 }
 
 impl From<Model> for ModelParts {
     fn from(m: Model) -> Self {
         let (numbers, corrections) = (m.numbers.to_vec(), m.corrections.to_vec());
-        Self { levels: m.levels, refiners: m.refiners, numbers, corrections }
+        let learnt = |r: [Refiner; REFINER_PASSES]| (r != [Refiner::default(); REFINER_PASSES]).then_some(r);
+        let refiners = m.refiners.into_iter().map(learnt).collect();
+        Self { levels: m.levels, refiners, numbers, corrections }
     }
 }
 
