@@ -282,9 +282,9 @@ fn pump(
     done: &AtomicU64,
 ) {
     // Where in the connection's life something happens to it.
-    let cut_at = (spoil && dice.roll() < faults.cut).then(|| dice.below(15_000));
+    let cut_at = (spoil && dice.roll() < faults.cut).then(|| dice.below(60_000));
     let cut_at = if spoil { cut_at } else { faults.first_cut_at };
-    let stall_at = (spoil && dice.roll() < faults.stalled).then(|| dice.below(15_000));
+    let stall_at = (spoil && dice.roll() < faults.stalled).then(|| dice.below(60_000));
     let delay = faults.delay.mul_f64(dice.roll());
     let (mut sent, mut stalled) = (0, false);
     let mut buffer = vec![0; 4096];

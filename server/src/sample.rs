@@ -151,6 +151,8 @@ pub fn write(path: &Path, samples: u32) -> Result<(), String> {
     tag(33922, &tie)?;
     tag(34735, &keys)?;
     tag(42113, &nodata.as_str())?;
+    // Made here and not by whichever worker asks first: making it needs the workers, who would wait for it.
+    LazyLock::force(&LAND);
     let last = f64::from(samples - 1);
     let rows_a_strip = 64;
     image.rows_per_strip(rows_a_strip).map_err(|e| failed(&e))?;

@@ -85,8 +85,10 @@ fn spread(list: &[Diamond], count: usize) -> Vec<Diamond> {
     (0..count).map(|i| list[i * list.len() / count]).collect()
 }
 
-/// How many times the root mean square of what the next level adds a level's step is: some eight times that is
-/// the largest that it adds anywhere in a diamond, and so the error at which the level is used.
+/// How many times the root mean square of what the next level adds a level's step may be. The largest that it adds
+/// in a diamond, the error at which the level is used, is some eight times it. Larger steps cost more in the end
+/// and gain little: alps at 1 m takes 2, 4 and 6 % more than steps that are fine at once, for 2.5, 4 and 9 times, and
+/// a view of it 256, 153 and 175 kB.
 const STEP_TO_DETAIL: f64 = 4.0;
 
 /// A step for each level, so that views do not pay for a precision that they cannot show, and how many levels
@@ -99,12 +101,11 @@ fn exponents(plan: &Plan, canvas: &Canvas, fine_step: u32) -> io::Result<(Vec<u8
     let mut details: Vec<f64> =
         (0..lattice as u32).map(|level| detail(plan, canvas, level)).collect::<io::Result<_>>()?;
     details.push(next_detail(&details));
-    let c = std::env::var("DIAMANTINA_C").ok().and_then(|v| v.parse().ok()).unwrap_or(STEP_TO_DETAIL);
     let mut exponents = vec![0u8; lattice + 1];
     // exponents[i + 1] is level i's.
     for i in (0..=lattice).rev() {
         let mut exponent = exponents.get(i + 1).copied().unwrap_or(0);
-        while (f64::from(fine_step) * 3f64.powi(i32::from(exponent) + 1)) <= c * details[i]
+        while (f64::from(fine_step) * 3f64.powi(i32::from(exponent) + 1)) <= STEP_TO_DETAIL * details[i]
             && fine_step.saturating_mul(3u32.pow(u32::from(exponent) + 1)) < STEP_MAX / 4
         {
             exponent += 1;
