@@ -136,24 +136,28 @@ impl Coding {
     ///
     /// Points off both diagonals lie strictly inside a diamond of the next level, those on a diagonal
     /// inside one of the level after it, and the centre inside none: whoever is last gives the fine step.
+    /// The diagonals become the sides of the next level's diamonds, and have its step in advance: with a
+    /// coarser one, the few points there would keep the error of all that is drawn at that level.
     pub(super) fn exponent(&self, level: u32, place: Place) -> u8 {
-        let next_inside = match place {
-            Place::Centre => return 0,
-            Place::Hypotenuse | Place::OtherDiagonal => level + 2,
-            Place::Off => level + 1,
-        };
-        if next_inside < self.levels() { self.level_exponent(level) } else { 0 }
+        match place {
+            Place::Off if level + 1 < self.levels() => self.level_exponent(level),
+            Place::Hypotenuse | Place::OtherDiagonal if level + 2 < self.levels() => {
+                self.level_exponent(level + 1)
+            }
+            _ => 0,
+        }
     }
 
     /// The exponent that an old point strictly inside a diamond of `level` has before the split.
     ///
-    /// It was last strictly inside a parent, or, on the hypotenuse (the parents' border), a grandparent.
+    /// It was last strictly inside a parent, off its diagonals, or, on the hypotenuse (the parents' border), on
+    /// a diagonal of a grandparent. Both left it the exponent of the level before this one.
     pub(super) fn exponent_before(&self, level: u32, place: Place) -> u8 {
         let since = match place {
             Place::Hypotenuse | Place::Centre => 2,
             Place::OtherDiagonal | Place::Off => 1,
         };
-        if level >= since { self.level_exponent(level - since) } else { self.first_exponent() }
+        if level >= since { self.level_exponent(level - 1) } else { self.first_exponent() }
     }
 }
 
