@@ -85,8 +85,8 @@ fn spread(list: &[Diamond], count: usize) -> Vec<Diamond> {
     (0..count).map(|i| list[i * list.len() / count]).collect()
 }
 
-/// How many times what the next level typically adds a level's step may be. The largest that it adds in a diamond,
-/// the error at which the level is used, is some eight times it. Larger steps cost more in the end and gain little.
+/// How many times what the next level typically adds a level's step may be. A level is used at errors about as large
+/// as the largest that it adds, which is several times that. Larger steps cost more in the end and gain little.
 const STEP_TO_DETAIL: f64 = 4.0;
 /// The same for the step of the finest lattice. It may be larger: views at any finer error start from it, where
 /// the next lattice would have been used at one error alone. Alps at 1 m take 2.3 % more with 4 and 3.9 % with 5,
