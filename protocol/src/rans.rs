@@ -26,6 +26,8 @@
     reason = "states are 32 bits, probabilities 12, words 16: each cast says so beside it"
 )]
 
+use std::sync::LazyLock;
+
 /// Bits of a probability.
 pub const PRECISION: u32 = 12;
 
@@ -53,6 +55,30 @@ struct Step {
     lane: u8,
 }
 
+/// What is needed of each share: how many 2^-16 bits it costs, and its reciprocal.
+struct Shares {
+    costs: [u32; TOTAL as usize + 1],
+    reciprocals: [u64; TOTAL as usize + 1],
+}
+
+static SHARES: LazyLock<Box<Shares>> = LazyLock::new(|| {
+    let mut shares =
+        Box::new(Shares { costs: [0; TOTAL as usize + 1], reciprocals: [0; TOTAL as usize + 1] });
+    for share in 1..=TOTAL {
+        let bits = f64::from(PRECISION) - f64::from(share).log2();
+        shares.costs[share as usize] = (bits * f64::from(1 << 16)).round() as u32;
+        shares.reciprocals[share as usize] = (1u64 << (32 + PRECISION)).div_ceil(u64::from(share));
+    }
+    shares
+});
+
+/// A state divided by a share, given the share's reciprocal: exact, since 2^44 over it is rounded up by less than
+/// a share out of 2^32 times as much (Granlund and Montgomery 1994).
+#[inline(always)]
+fn quotient(state: u32, reciprocal: u64) -> u32 {
+    ((u128::from(state) * u128::from(reciprocal)) >> (32 + PRECISION)) as u32
+}
+
 /// Collects symbols and turns them into bytes. Takes 6 bytes a symbol until it is finished.
 #[derive(Debug, Default)]
 pub struct Encoder {
@@ -63,6 +89,17 @@ impl Encoder {
     /// Appends a symbol that takes the probabilities `start..start + share` of [`TOTAL`]; share above 0.
     pub fn symbol(&mut self, lane: u8, start: u16, share: u16) {
         self.steps.push(Step { start, share, bits: 0, lane });
+    }
+
+    /// Appends symbols given as start and share, the lanes taking turns.
+    pub fn symbols(&mut self, symbols: impl ExactSizeIterator<Item = (u16, u16)>) {
+        let symbols = symbols.enumerate();
+        self.steps.extend(symbols.map(|(i, (start, share))| Step {
+            start,
+            share,
+            bits: 0,
+            lane: (i & 1) as u8,
+        }));
     }
 
     /// Appends the `bits` low bits of `value`, at most [`PLAIN_MAX`], each costing one bit.
@@ -101,10 +138,10 @@ impl Encoder {
     /// About how many bits the symbols will take.
     #[must_use]
     pub fn bits(&self) -> f64 {
-        let cost = |s: &Step| {
-            if s.share == 0 { f64::from(s.bits) } else { f64::from(PRECISION) - f64::from(s.share).log2() }
-        };
-        self.steps.iter().map(cost).sum()
+        let costs = &SHARES.costs;
+        let cost =
+            |s: &Step| if s.share == 0 { u32::from(s.bits) << 16 } else { costs[usize::from(s.share)] };
+        self.steps.iter().map(|s| u64::from(cost(s))).sum::<u64>() as f64 / f64::from(1 << 16)
     }
 
     /// The finished bytes, in one lane or in two.
@@ -115,6 +152,7 @@ impl Encoder {
         }
         let mut states = [beginning(lanes); 2];
         let mut words: Vec<u16> = Vec::with_capacity(self.steps.len());
+        let reciprocals = &SHARES.reciprocals;
         for step in self.steps.iter().rev() {
             let state = &mut states[usize::from(step.lane) % lanes];
             let (share, precision) =
@@ -124,7 +162,8 @@ impl Encoder {
                 words.push(*state as u16);
                 *state >>= 16;
             }
-            *state = ((*state / share) << precision) + *state % share + u32::from(step.start);
+            let many = quotient(*state, reciprocals[share as usize]);
+            *state = (many << precision) + (*state - many * share) + u32::from(step.start);
         }
         if lanes == 1 && words.is_empty() {
             let zeros = states[0].leading_zeros() as usize / 8;

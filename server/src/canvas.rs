@@ -3,7 +3,7 @@
 //! Plane j holds the samples whose coordinates are multiples of 2^j, rows from the south. A build reads
 //! each source sample once (twice where the quantum has to be found first) and from then on only windows
 //! of planes: the finest near the diamonds at hand, coarser ones farther out. Memory: one row buffer a
-//! reader; disk: 16/3 bytes a sample.
+//! reader; disk: 16/3 bytes a sample, in the machine's own order of bytes.
 
 use diamantina_protocol::NODATA;
 use std::fs::File;
@@ -128,17 +128,23 @@ impl Canvas {
     /// When the disk is full or fails.
     pub fn write_rows(&self, y0: u32, heights: &[i32]) -> io::Result<()> {
         let row = self.planes[0].width as usize;
-        let mut bytes = Vec::new();
+        let mut kept: Vec<i32> = Vec::new();
         for (j, plane) in self.planes.iter().enumerate() {
             let (step, wide) = (1u32 << j, 1usize << j);
             // Rows of this plane among those given lie one behind the other in its file.
             let first = y0.next_multiple_of(step);
-            bytes.clear();
-            for line in heights.chunks_exact(row).skip((first - y0) as usize).step_by(wide) {
-                bytes.extend(line.iter().step_by(wide).flat_map(|h| h.to_le_bytes()));
-            }
-            if !bytes.is_empty() {
-                plane.file.write_all_at(&bytes, u64::from(first >> j) * u64::from(plane.width) * 4)?;
+            kept.clear();
+            let of_plane = if j == 0 {
+                heights
+            } else {
+                for line in heights.chunks_exact(row).skip((first - y0) as usize).step_by(wide) {
+                    kept.extend(line.iter().step_by(wide));
+                }
+                &kept
+            };
+            if !of_plane.is_empty() {
+                let offset = u64::from(first >> j) * u64::from(plane.width) * 4;
+                plane.file.write_all_at(bytemuck::cast_slice(of_plane), offset)?;
             }
         }
         Ok(())
@@ -156,17 +162,12 @@ impl Canvas {
         let width = i1 - i0 + 1;
         let mut heights = vec![NODATA; width as usize * (j1 - j0 + 1) as usize];
         let inside = plane.width.saturating_sub(i0).min(width) as usize;
-        let mut bytes = vec![0; inside * 4];
         for (j, row) in (j0..=j1).zip(heights.chunks_exact_mut(width as usize)) {
             if inside == 0 || j >= plane.height {
                 break;
             }
-            plane
-                .file
-                .read_exact_at(&mut bytes, (u64::from(j) * u64::from(plane.width) + u64::from(i0)) * 4)?;
-            for (height, four) in row.iter_mut().zip(bytes.as_chunks::<4>().0) {
-                *height = i32::from_le_bytes(*four);
-            }
+            let offset = (u64::from(j) * u64::from(plane.width) + u64::from(i0)) * 4;
+            plane.file.read_exact_at(bytemuck::cast_slice_mut(&mut row[..inside]), offset)?;
         }
         Ok(Window { spacing_log2, x0: i0, y0: j0, width, heights })
     }

@@ -34,7 +34,7 @@
 
 use super::coding::{Coding, Place};
 use super::model::{FIRST_CORRECTION, REFINER_PASSES, Refiner, SPREAD_PARTS, SPREADS, TILT_PARTS, TILTS};
-use super::walk::{HEIGHT_BITS, steps};
+use super::walk::HEIGHT_BITS;
 use super::{DecodeError, Pass, Tally};
 use crate::NODATA;
 use crate::diamond::Block;
@@ -563,14 +563,21 @@ impl Thirds {
         let (mut next, mut beyond) = (0, 0);
         for Third { place: [x, y], count, step } in self.runs.iter().copied() {
             let first = raster.at(x, y);
+            // From point to point of a row's half the slots are as far apart.
+            let slot = raster.slot(x, y);
+            let apart = if count > 1 { raster.slot(x + 2, y) - slot } else { 0 };
             for i in 0..count {
                 if !raster.holes.is_empty() && raster.holes[first + i] {
                     continue;
                 }
                 let base = raster.heights[first + i];
                 let turn = |k: i32| if self.down[next] { -k } else { k };
-                let wanted = |h: i32| turn(steps(h - base, step).clamp(-1, 1));
-                let number = pass.number(self.numbers[next], raster.slot(x + 2 * i, y), wanted);
+                // The outer thirds begin at half a step, which is no whole number.
+                let wanted = |h: i32| {
+                    let twice = 2 * (h - base);
+                    turn(i32::from(twice > step) - i32::from(twice < -step))
+                };
+                let number = pass.number(self.numbers[next], slot + i * apart, wanted);
                 self.numbers[next] = number;
                 // Where numbers are damaged they are still small: corrections have three symbols.
                 let height = base + turn(number) * step;

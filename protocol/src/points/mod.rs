@@ -138,7 +138,8 @@ pub fn encode(forest: &Forest, coding: &Coding, d: Diamond, block: &mut Block, s
     let upper = forest.local(d).upper;
     let n = block.segments();
     let (mut all_valid, mut as_inferred) = (true, !root);
-    if forest.adds_points(d.level()) {
+    // Where all have a height, nothing needs to be looked up cell by cell.
+    if forest.adds_points(d.level()) && source.heights().contains(&NODATA) {
         let (old, new) = source.parts();
         all_valid = !root || !old.contains(&NODATA);
         for (v, row) in new.chunks_exact(n).enumerate() {
@@ -173,6 +174,9 @@ pub fn encode(forest: &Forest, coding: &Coding, d: Diamond, block: &mut Block, s
 
 /// Like [`encode`], without the bytes: leaves in `block` what a receiver will have.
 pub fn quantise(forest: &Forest, coding: &Coding, d: Diamond, block: &mut Block, source: &Block) {
+    if source.heights().iter().all(|h| *h == NODATA) {
+        return;
+    }
     let _ =
         walk(forest, coding, d, block, Known::Sent, &mut Rounder { source: source.heights(), counts: None });
 }
@@ -284,9 +288,7 @@ impl Pass for Sender<'_> {
     }
     fn send(&mut self, tables: &Tables, classes: &[u8], numbers: &[i32]) {
         self.is_silent &= numbers.iter().all(|k| *k == 0);
-        for (lane, (class, number)) in [0, 1].into_iter().cycle().zip(classes.iter().zip(numbers)) {
-            tables.encode(&mut self.coder, lane, *class, *number);
-        }
+        tables.encode(&mut self.coder, classes, numbers);
     }
     fn new_points(&mut self) -> bool {
         self.quiet_from = Some(self.coder.len());

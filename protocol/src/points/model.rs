@@ -407,14 +407,24 @@ impl Tables {
         Self { numbers, corrections: corrections.iter().map(|c| thirds(*c)).collect() }
     }
 
-    /// Appends a number, of magnitude below 2^27, under its class.
-    pub fn encode(&self, coder: &mut Encoder, lane: u8, class: u8, value: i32) {
-        if let Some(correction) = class.checked_sub(FIRST_CORRECTION) {
-            let bounds = &self.corrections[usize::from(correction)];
-            let k = (value.clamp(-1, 1) + 1) as usize;
-            coder.symbol(lane, bounds[k], bounds[k + 1] - bounds[k]);
+    /// Appends numbers, of magnitude below 2^27, under their classes, the lanes taking turns. The classes are all of
+    /// numbers or all of corrections.
+    pub fn encode(&self, coder: &mut Encoder, classes: &[u8], numbers: &[i32]) {
+        if classes.first().is_some_and(|class| *class >= FIRST_CORRECTION) {
+            coder.symbols(classes.iter().zip(numbers).map(|(class, number)| {
+                let bounds = &self.corrections[usize::from(class.saturating_sub(FIRST_CORRECTION))];
+                let k = (number.clamp(&-1, &1) + 1) as usize;
+                (bounds[k], bounds[k + 1] - bounds[k])
+            }));
             return;
         }
+        for (lane, (class, number)) in [0, 1].into_iter().cycle().zip(classes.iter().zip(numbers)) {
+            self.encode_number(coder, lane, *class, *number);
+        }
+    }
+
+    #[inline(always)]
+    fn encode_number(&self, coder: &mut Encoder, lane: u8, class: u8, value: i32) {
         let table = &self.numbers[usize::from(class)];
         // Bins are centred on zero.
         let half = (1 << table.shift) >> 1;
@@ -671,11 +681,9 @@ mod tests {
         ) {
             let tables = Tables::new(&[hazards; CLASSES], &[[2000, 2100]; CORRECTION_CLASSES]);
             let mut coder = Encoder::default();
-            for (i, (class, value)) in items.iter().enumerate() {
-                tables.encode(&mut coder, (i % 2) as u8, *class, *value);
-            }
-            let bytes = coder.finish(lanes);
             let (classes, values): (Vec<u8>, Vec<i32>) = items.into_iter().unzip();
+            tables.encode(&mut coder, &classes, &values);
+            let bytes = coder.finish(lanes);
             let mut coder = Decoder::new(&bytes, lanes).unwrap();
             let mut found = vec![0; values.len()];
             tables.decode(&mut coder, &classes, &mut found);
@@ -694,9 +702,7 @@ mod tests {
             let mut coder = Encoder::default();
             let (classes, values): (Vec<u8>, Vec<i32>) =
                 items.into_iter().map(|(class, value)| (class + FIRST_CORRECTION, value)).unzip();
-            for (i, (class, value)) in classes.iter().zip(&values).enumerate() {
-                tables.encode(&mut coder, (i % 2) as u8, *class, *value);
-            }
+            tables.encode(&mut coder, &classes, &values);
             let bytes = coder.finish(lanes);
             let mut coder = Decoder::new(&bytes, lanes).unwrap();
             let mut found = vec![0; values.len()];
@@ -747,7 +753,7 @@ mod tests {
         let tables = counts.model(vec![[Kernel::default(); 2]], vec![[Refiner::default(); REFINER_PASSES]]);
         let cost = |value| {
             let mut coder = Encoder::default();
-            tables.tables().encode(&mut coder, 0, usual, value);
+            tables.tables().encode(&mut coder, &[usual], &[value]);
             coder.bits()
         };
         assert!(

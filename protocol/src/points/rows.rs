@@ -87,14 +87,19 @@ impl Ground {
         let (n, row) = (self.n, self.n + 3);
         let known = |u: usize, v: usize| (upper || u >= v) && old[v * (n + 1) + u] != NODATA;
         let mut have: Vec<bool> = (0..(n + 1) * (n + 1)).map(|i| known(i % (n + 1), i / (n + 1))).collect();
-        let mut holes: Vec<(usize, usize)> = (0..=n)
+        let is_hole = |have: &[bool], u: usize, v: usize| (upper || u >= v) && !have[v * (n + 1) + u];
+        let mut ring: Vec<(usize, usize)> = (0..=n)
             .flat_map(|v| (if upper { 0 } else { v }..=n).map(move |u| (u, v)))
-            .filter(|(u, v)| !have[v * (n + 1) + u])
+            .filter(|(u, v)| is_hole(&have, *u, *v))
             .collect();
+        for &(u, v) in &ring {
+            self.heights[(v + 1) * row + u + 1] = 0.0;
+        }
+        ring.retain(|&(u, v)| around(u, v, n).any(|(i, j)| have[j * (n + 1) + i]));
         let mut filled = Vec::new();
-        while !holes.is_empty() {
+        while !ring.is_empty() {
             filled.clear();
-            holes.retain(|&(u, v)| {
+            for &(u, v) in &ring {
                 let (mut sum, mut count) = (0.0f32, 0.0f32);
                 for (i, j) in around(u, v, n) {
                     if have[j * (n + 1) + i] {
@@ -102,22 +107,19 @@ impl Ground {
                         count += 1.0;
                     }
                 }
-                if count > 0.0 {
-                    filled.push((u, v, sum / count));
-                }
-                count == 0.0
-            });
-            if filled.is_empty() {
-                // Nothing is known at all.
-                break;
+                filled.push((u, v, sum / count));
             }
             for &(u, v, height) in &filled {
                 self.heights[(v + 1) * row + u + 1] = height;
                 have[v * (n + 1) + u] = true;
             }
-        }
-        for (u, v) in holes {
-            self.heights[(v + 1) * row + u + 1] = 0.0;
+            // The next ring: what lies next to this one and is still unknown.
+            ring.clear();
+            for &(u, v, _) in &filled {
+                ring.extend(around(u, v, n).filter(|(i, j)| is_hole(&have, *i, *j)));
+            }
+            ring.sort_unstable();
+            ring.dedup();
         }
     }
 

@@ -18,12 +18,34 @@ use crate::rans::Context;
 use crate::{HEIGHT_MAX, NODATA};
 
 /// The multiple of `step` nearest to `value`, in steps; `step` is odd, so nothing lies half way.
-pub(super) fn steps(value: i32, step: i32) -> i32 {
-    if step == 1 {
-        return value;
+fn steps(value: i32, step: i32) -> i32 {
+    Divisor::new(step).steps(value)
+}
+
+/// Division by one step again and again, as a multiplication (Granlund and Montgomery 1994, *Division by
+/// invariant integers using multiplication*).
+#[derive(Debug, Clone, Copy)]
+struct Divisor {
+    step: i32,
+    reciprocal: u64,
+    shift: u32,
+}
+
+impl Divisor {
+    /// By a step from 1 to [`super::STEP_MAX`].
+    fn new(step: i32) -> Self {
+        // With 2^shift of 32 more bits than the step has, the reciprocal rounded up is exact for all of 32 bits.
+        let shift = 32 + (32 - (step as u32 - 1).leading_zeros());
+        Self { step, reciprocal: (1u64 << shift).div_ceil(step as u64), shift }
     }
-    let magnitude = (value.unsigned_abs() + (step as u32 - 1) / 2) / step as u32;
-    if value < 0 { -(magnitude as i32) } else { magnitude as i32 }
+
+    /// The multiple of the step nearest to `value`, in steps.
+    #[inline(always)]
+    fn steps(self, value: i32) -> i32 {
+        let dividend = value.unsigned_abs() + (self.step as u32 - 1) / 2;
+        let magnitude = ((u128::from(dividend) * u128::from(self.reciprocal)) >> self.shift) as i32;
+        if value < 0 { -magnitude } else { magnitude }
+    }
 }
 
 /// `base + k * step`, if that is a height.
@@ -259,6 +281,7 @@ struct NewRows<'a> {
     below: Below,
     /// Steps of new points off the diagonals and on them.
     steps: [i32; 2],
+    divisors: [Divisor; 2],
     /// Of every place of the row: the prediction, the part of it that comes from old points (both less the
     /// base), and the class.
     guesses: Vec<i32>,
@@ -276,6 +299,7 @@ impl<'a> NewRows<'a> {
         if coding.rule() == Rule::Midpoint {
             kernel.causal = [0; 4];
         }
+        let steps = [Place::Off, Place::Hypotenuse].map(|p| coding.step(coding.exponent(level, p)));
         Self {
             n,
             coding,
@@ -283,7 +307,8 @@ impl<'a> NewRows<'a> {
             ground: Ground::new(old, n, local.upper),
             row: Row::new(n),
             below: Below::new(n),
-            steps: [Place::Off, Place::Hypotenuse].map(|p| coding.step(coding.exponent(level, p))),
+            steps,
+            divisors: steps.map(Divisor::new),
             guesses: vec![0; n],
             bases: vec![0; n],
             classes: vec![0; n],
@@ -361,9 +386,9 @@ impl<'a> NewRows<'a> {
             before = u;
             let causal = (west_weight * missing + (1 << (CAUSAL_BITS - 1))) >> CAUSAL_BITS;
             let deduced = i64::from(base) + i64::from(self.guesses[u]) + causal;
-            let step = self.steps[usize::from(u == v || u + v == n - 1)];
-            *number = pass.number(*number, slot + u, |h| steps((i64::from(h) - deduced) as i32, step));
-            let height = deduced + i64::from(*number) * i64::from(step);
+            let divisor = &self.divisors[usize::from(u == v || u + v == n - 1)];
+            *number = pass.number(*number, slot + u, |h| divisor.steps((i64::from(h) - deduced) as i32));
+            let height = deduced + i64::from(*number) * i64::from(divisor.step);
             beyond |= height.unsigned_abs() >> HEIGHT_BITS;
             line[u] = height as i32;
             missing = height - i64::from(base) - i64::from(self.bases[u]);

@@ -6,6 +6,7 @@ use super::journal::{Chunk, Coded, Record};
 use super::surface::{Surface, source_block};
 use super::tallies::Tally;
 use super::{Build, BuildError};
+use crate::canvas::Window;
 use crate::measure::{Found, Samples, measure};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
@@ -165,13 +166,23 @@ impl Build<'_> {
             }
         }
         let mut before: HashMap<Diamond, Block> = HashMap::new();
+        let mut around = None;
         for (level, diamonds) in (own..).zip(&self.plan.chunks.needed(corner)) {
+            let Some(bounds) = bounds(forest, diamonds) else { continue };
+            // Two levels of the lattice share a plane, and those past it the finest. What parents cover holds their
+            // children, so the first window that is read of a plane does for all.
+            let spacing = self.plan.spacing_log2(level + 1);
+            let window = match around.take().filter(|w: &Window| w.spacing_log2() == spacing) {
+                Some(window) => window,
+                None => self.canvas.read(spacing, bounds[0], bounds[1]).map_err(self.work.failure())?,
+            };
             // What the last level of the lattice draws, and those past it, is at the samples' own places: there
             // the diamonds compare themselves.
             let draws = level + 1 < forest.lattice_levels();
             let mut surface = draws.then(|| Surface::new(self.plan.spacing_log2(level + 1), corner, cells));
-            before =
-                self.chunk_level((corner, level), diamonds, &before, surface.as_mut(), coarse, &mut chunk)?;
+            let work = Level { corner, level, diamonds, window: &window, before: &before, coarse };
+            before = self.chunk_level(&work, surface.as_mut(), &mut chunk)?;
+            around = Some(window);
             if let Some(surface) = surface.filter(|_| !samples.is_empty()) {
                 measure(forest, level + 1, &samples, surface.nodes(), &mut found);
             }
@@ -181,22 +192,17 @@ impl Build<'_> {
     }
 
     /// Codes the diamonds of one level of a chunk, those that it owns for good, and draws all, if there is
-    /// something to draw to. Their blocks. The chunk is given by its corner.
+    /// something to draw to. Their blocks.
     fn chunk_level(
         &self,
-        (corner, level): ([u32; 2], u32),
-        diamonds: &BTreeSet<Diamond>,
-        before: &HashMap<Diamond, Block>,
+        work: &Level<'_>,
         mut surface: Option<&mut Surface>,
-        coarse: &Coarse,
         chunk: &mut Chunk,
     ) -> Result<HashMap<Diamond, Block>, BuildError> {
         let forest = &self.plan.forest;
         let side = 1u32 << self.plan.chunks.side_log2();
+        let &Level { corner, level, diamonds, window, before, coarse } = work;
         let mut here = HashMap::with_capacity(diamonds.len());
-        let Some([low, high]) = bounds(forest, diamonds) else { return Ok(here) };
-        let spacing = self.plan.spacing_log2(level + 1);
-        let window = self.canvas.read(spacing, low, high).map_err(self.work.failure())?;
         for d in diamonds {
             if self.work.progress.is_out_of_patience() {
                 return Err(self.interrupted());
@@ -205,7 +211,7 @@ impl Build<'_> {
             if level == self.plan.chunks.level() && level > 0 {
                 take_over(forest, *d, coarse, &mut block);
             }
-            let source = source_block(forest, *d, &window);
+            let source = source_block(forest, *d, window);
             if self.plan.chunks.owns(corner, *d) {
                 if !forest.adds_points(level) {
                     let vertical = distance(&block, &source);
@@ -227,6 +233,17 @@ impl Build<'_> {
     }
 }
 
+/// What a level of a chunk is made from. The chunk is given by its corner; the window holds the samples of all of
+/// the diamonds.
+struct Level<'a> {
+    corner: [u32; 2],
+    level: u32,
+    diamonds: &'a BTreeSet<Diamond>,
+    window: &'a Window,
+    before: &'a HashMap<Diamond, Block>,
+    coarse: &'a Coarse,
+}
+
 /// The old points of a diamond of the chunks' own level, which starts from what the coarse levels left.
 fn take_over(forest: &Forest, d: Diamond, coarse: &Coarse, block: &mut Block) {
     let Some(last) = coarse.surfaces.last() else { return };
@@ -240,8 +257,11 @@ fn take_over(forest: &Forest, d: Diamond, coarse: &Coarse, block: &mut Block) {
 
 /// The largest distance between what a diamond has and its samples, in quanta.
 fn distance(block: &Block, source: &Block) -> f64 {
-    let both = block.heights().iter().zip(source.heights()).filter(|(_, sample)| **sample != NODATA);
-    both.map(|(drawn, sample)| drawn.abs_diff(*sample)).max().unwrap_or(0).into()
+    let both = block.heights().iter().zip(source.heights());
+    // Without a branch, so that it becomes a loop over vectors.
+    let distance =
+        |(drawn, sample): (&i32, &i32)| if *sample == NODATA { 0 } else { drawn.abs_diff(*sample) };
+    both.map(distance).fold(0, u32::max).into()
 }
 
 /// The block of a diamond with the old points that its parents leave.
@@ -258,8 +278,14 @@ fn inherited(forest: &Forest, before: &HashMap<Diamond, Block>, d: Diamond) -> B
 impl Coded {
     /// What coding a diamond gave.
     pub(super) fn new(d: Diamond, block: &Block, source: &Block, spot: Option<crate::store::Spot>) -> Self {
-        let all = block.heights().iter().chain(source.heights()).filter(|h| **h != NODATA);
-        let (low, high) = all.fold((i32::MAX, i32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+        // Nodata is the least number there is: it is above no height, and must not be taken for the lowest.
+        let range = |heights: &[i32]| {
+            heights.iter().fold((i32::MAX, NODATA), |(low, high), height| {
+                (low.min(if *height == NODATA { i32::MAX } else { *height }), high.max(*height))
+            })
+        };
+        let (drawn, own) = (range(block.heights()), range(source.heights()));
+        let (low, high) = (drawn.0.min(own.0), drawn.1.max(own.1));
         Self { centre: d.centre(), low, high, spot }
     }
 }
