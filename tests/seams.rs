@@ -6,6 +6,7 @@ use diamantina_client::camera::Camera;
 use diamantina_client::cut::{self, Ask};
 use diamantina_client::drawing::DrawItem;
 use diamantina_client::headless;
+use diamantina_client::sight::Sight;
 use diamantina_client::surface::Surface;
 use diamantina_client::terrain::{self, Terrain};
 use diamantina_protocol::NODATA;
@@ -155,6 +156,7 @@ fn any_cut_of_a_built_store_with_anything_missing_has_no_cracks() {
                 camera: &camera,
                 exaggeration: 1.0,
                 tolerance_pixels: 0.005 * 300f64.powf(dice.roll()),
+                sight: Sight { vertical: round % 2 == 0, foveation: if round % 3 == 0 { 4.0 } else { 1.0 } },
                 memory_bytes: if round % 7 == 6 { 40 * largest } else { usize::MAX },
             };
             let ideal = cut::choose(&ask, |d| Some(entries[&d]));

@@ -233,6 +233,7 @@ impl Index {
 mod tests {
     use super::*;
     use crate::cut::{Ask, choose};
+    use crate::sight::Sight;
     use crate::world::{Dice, any_camera, surfaces, world};
 
     #[test]
@@ -251,6 +252,7 @@ mod tests {
                 camera: &camera,
                 exaggeration: 1.0,
                 tolerance_pixels: 0.5,
+                sight: Sight::default(),
                 memory_bytes: 225 * size,
             };
             let ideal = choose(&ask, |d| Some(built.entries[&d]));

@@ -111,13 +111,6 @@ impl Camera {
         f64::from(self.size[1]) / (2.0 * (self.fov_y / 2.0).tan())
     }
 
-    /// The apparent size, in pixels, of a sphere of radius `error_metres` at `distance` metres: the
-    /// screen-space error. Infinite at distance 0, unless the error is 0.
-    #[must_use]
-    pub fn error_pixels(&self, error_metres: f32, distance: f64) -> f64 {
-        if error_metres <= 0.0 { 0.0 } else { f64::from(error_metres) * self.pixels_per_radian() / distance }
-    }
-
     /// The four sides of the view and the plane of the eye, pointing inside.
     #[must_use]
     pub fn planes(&self) -> [Plane; 5] {
@@ -180,9 +173,7 @@ mod tests {
     #[test]
     fn a_metre_shrinks_with_distance() {
         let camera = camera();
-        let near = camera.error_pixels(1.0, 1000.0);
+        let near = camera.pixels_per_radian() / 1000.0;
         assert!((near - 0.927).abs() < 1e-3, "{near}");
-        assert!((camera.error_pixels(1.0, 2000.0) * 2.0 - near).abs() < 1e-12);
-        assert_eq!(camera.error_pixels(0.0, 0.0), 0.0);
     }
 }

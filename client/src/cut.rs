@@ -14,6 +14,7 @@
 
 use crate::camera::{Bounds, Camera, Plane, nearest_drawn};
 use crate::drawing::DrawItem;
+use crate::sight::{self, Sight};
 use crate::surface::Surface;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
@@ -39,6 +40,8 @@ pub struct Ask<'a> {
     pub exaggeration: f64,
     /// The error to reach, in pixels.
     pub tolerance_pixels: f64,
+    /// How errors count on the screen.
+    pub sight: Sight,
     /// Bytes that the surfaces of split diamonds may take; the roots are split in any case.
     pub memory_bytes: usize,
 }
@@ -49,12 +52,16 @@ impl Ask<'_> {
         bounds(self.layer, d, entry).stretched(self.exaggeration)
     }
 
-    /// The largest apparent size, in pixels, of an error anywhere in a box. Finite, even if the eye is in the
-    /// box: nothing nearer than the near plane is drawn.
-    fn pixels(&self, error_metres: f32, bounds: &Bounds) -> f64 {
-        let distance = bounds.distance(self.camera.eye).max(nearest_drawn(self.layer.cell));
+    /// The largest apparent size, in pixels, of the error of triangles of a level anywhere in a box.
+    fn pixels(&self, level: u32, error_metres: f32, bounds: &Bounds) -> f64 {
+        let layer = self.layer;
+        // Where outlines differ, the length of a hypotenuse is part of the error; what is below it is of heights.
+        let vertical = level >= layer.forest.levels()
+            || f64::from(error_metres) < layer.forest.hypotenuse(level, layer.cell);
         // Heights pressed together leave the errors of outlines as they are.
-        self.exaggeration.max(1.0) * self.camera.error_pixels(error_metres, distance)
+        let stretch = if vertical { self.exaggeration } else { self.exaggeration.max(1.0) };
+        let error = sight::Error { metres: f64::from(error_metres) * stretch, vertical };
+        self.sight.pixels(self.camera, error, bounds, nearest_drawn(layer.cell))
     }
 }
 
@@ -344,7 +351,7 @@ impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
         let entry = found.or(parent).unwrap_or_else(|| unknown(self.ask.layer));
         let bounds = self.ask.bounds(d, &entry);
         let in_view = !entry.is_empty() && bounds.touches(&self.planes);
-        let pixels = if in_view { self.ask.pixels(entry.error_metres, &bounds) } else { 0.0 };
+        let pixels = if in_view { self.ask.pixels(d.level(), entry.error_metres, &bounds) } else { 0.0 };
         // Beyond the picture's height, more error is no worse.
         let priority = pixels.min(f64::from(self.ask.camera.size[1]));
         let number = u32::try_from(self.ideal.nodes.len()).unwrap_or(NONE);
@@ -389,7 +396,10 @@ impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
         }
         let finest = diamond.level() + 1 == self.forest.levels() && in_view;
         self.ideal.finest_pixels.push(if finest {
-            self.ask.pixels(self.ask.layer.finest_error, &self.ask.bounds(diamond, &entry))
+            {
+                let (level, finest) = (self.forest.levels(), self.ask.layer.finest_error);
+                self.ask.pixels(level, finest, &self.ask.bounds(diamond, &entry))
+            }
         } else {
             0.0
         });
@@ -475,7 +485,15 @@ mod tests {
     type Side = Vec<([i64; 2], i32)>;
 
     fn ask<'a>(built: &'a Built, camera: &'a Camera, tolerance_pixels: f64) -> Ask<'a> {
-        Ask { layer: &built.layer, camera, exaggeration: 1.0, tolerance_pixels, memory_bytes: usize::MAX }
+        let sight = Sight::default();
+        Ask {
+            layer: &built.layer,
+            camera,
+            exaggeration: 1.0,
+            tolerance_pixels,
+            sight,
+            memory_bytes: usize::MAX,
+        }
     }
 
     /// The three sides of a drawn triangle: lattice points with their heights, from the lesser end.
@@ -621,8 +639,7 @@ mod tests {
                     assert!(
                         entry.is_empty()
                             || !bounds.touches(&camera.planes())
-                            || camera.error_pixels(entry.error_metres, bounds.distance(camera.eye))
-                                <= tolerance
+                            || ask.pixels(child.level(), entry.error_metres, &bounds) <= tolerance
                     );
                 }
             }
@@ -633,6 +650,30 @@ mod tests {
                 assert!(forest.parents(*d).all(|p| order[..at].contains(&p)), "parents are asked for first");
             }
         }
+    }
+
+    #[test]
+    fn seen_from_above_the_same_tolerance_needs_fewer_splits() {
+        let built = &world()[0];
+        let mut dice = Dice(5);
+        let sphere = Sight { vertical: false, ..Sight::default() };
+        let (mut with, mut without) = (0, 0);
+        for _ in 0..40 {
+            let above = above();
+            // Straight down, from where a level or so is too coarse.
+            let eye = above.eye + DVec3::Z * above.eye.z * dice.roll();
+            let camera = Camera { eye, target: eye - DVec3::Z, ..above };
+            let splits = |sight| -> HashSet<Diamond> {
+                let ask = Ask { sight, ..ask(built, &camera, 1.0) };
+                choose(&ask, |d| Some(built.entries[&d])).splits().collect()
+            };
+            let (vertical, sphere) = (splits(Sight::default()), splits(sphere));
+            assert!(vertical.is_subset(&sphere), "what is not split looks no larger than a sphere does");
+            with += vertical.len();
+            without += sphere.len();
+        }
+        println!("{with} splits, {without} with spheres");
+        assert!(with * 4 < without * 3, "{with} of {without}");
     }
 
     #[test]
@@ -653,7 +694,9 @@ mod tests {
             let eye = camera.eye.with_z(camera.eye.z * exaggeration);
             let target = if round % 3 == 0 { eye - DVec3::Z } else { camera.target };
             let camera = Camera { eye, target, ..camera };
-            let ask = Ask { exaggeration, ..ask(built, &camera, 2.0) };
+            // Taller errors might be taken for those of outlines: all count as spheres here.
+            let sight = Sight { vertical: false, ..Sight::default() };
+            let ask = Ask { exaggeration, sight, ..ask(built, &camera, 2.0) };
             let ideal = choose(&ask, |d| Some(built.entries[&d]));
             let as_tall = Ask { layer: &tall, exaggeration: 1.0, ..ask };
             let expected = choose(&as_tall, |d| Some(taller(built.entries[&d])));
@@ -675,8 +718,8 @@ mod tests {
         let ask = Ask { layer: &lossy, ..ask(built, &camera, 1.0) };
         let ideal = choose(&ask, |d| Some(built.entries[&d]));
         let goal = draw(0, &ask, &ideal, |_| None).error_pixels_goal;
-        let nearest = camera.error_pixels(1.5, 0.05);
-        assert!(goal > camera.error_pixels(1.5, 1000.0) && goal <= nearest * (1.0 + 1e-6), "{goal}");
+        let sphere = |distance: f64| 1.5 * camera.pixels_per_radian() / distance;
+        assert!(goal > sphere(1000.0) && goal <= sphere(0.05) * (1.0 + 1e-6), "{goal}");
     }
 
     #[test]

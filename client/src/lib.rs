@@ -3,6 +3,7 @@
 //! | module | what it holds |
 //! |---|---|
 //! | [`camera`] | the eye; how large a metre looks |
+//! | [`sight`] | how large an error looks: metres and a box → pixels |
 //! | [`cut`] | camera and resident diamonds → what to draw and what to ask for |
 //! | [`fetch`] | requests by priority, retried, cancellable; answers as they stream in |
 //! | [`cache`] | decoded diamonds under a byte budget |
@@ -21,6 +22,7 @@ pub mod fetch;
 pub mod headless;
 pub mod picture;
 pub mod render;
+pub mod sight;
 pub mod surface;
 pub mod terrain;
 

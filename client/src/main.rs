@@ -5,6 +5,7 @@ use diamantina_client::camera::{Camera, FOV_Y};
 use diamantina_client::fetch::FetchError;
 use diamantina_client::headless::{self, Flight, FlightPath, FrameLine, PictureReport};
 use diamantina_client::render::{self, Background, Colours, Look, Sun};
+use diamantina_client::sight::Sight;
 use diamantina_client::terrain::{self, Terrain, TerrainError};
 use diamantina_protocol::message::Scene;
 use glam::DVec3;
@@ -43,6 +44,14 @@ struct ViewArgs {
     /// The largest error on the screen, in pixels
     #[arg(long, default_value_t = 1.0, value_name = "PIXELS")]
     error_pixels: f64,
+    /// Take an error for a sphere of its size, which looks the same from all sides. Without it errors of heights
+    /// count for less seen from above, where they hardly show
+    #[arg(long)]
+    sphere_error: bool,
+    /// How many times --error-pixels an error may reach at the picture's corners; 1 in the middle, and in between
+    /// in between
+    #[arg(long, default_value_t = 1.0, value_name = "TIMES")]
+    foveation: f64,
     /// How diamonds are encoded
     #[arg(long, default_value = "points", value_enum)]
     encoding: Encoding,
@@ -231,12 +240,16 @@ impl ViewArgs {
                 format!("--exaggeration {}: expected a number from {low} to {high}", self.exaggeration),
             ));
         }
+        if !(self.foveation.is_finite() && self.foveation >= 1.0) {
+            return Err(Failure(2, format!("--foveation {}: expected a number from 1 on", self.foveation)));
+        }
         let encoding = match self.encoding {
             Encoding::Points => terrain::ENCODING.to_owned(),
         };
         let options = terrain::Options {
             tolerance_pixels: self.error_pixels,
             memory_bytes: self.memory << 20,
+            sight: Sight { vertical: !self.sphere_error, foveation: self.foveation },
             encoding,
             ..terrain::Options::default()
         };

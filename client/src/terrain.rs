@@ -17,6 +17,7 @@ use crate::camera::{Camera, Plane};
 use crate::cut::{self, Ask, Ideal, Wish};
 use crate::drawing::DrawItem;
 use crate::fetch::{self, Event, FetchError, Fetcher, ROOT_BYTES, Traffic, Want};
+use crate::sight::Sight;
 use crate::surface::Surface;
 use bytes::Bytes;
 use diamantina_protocol::diamond::Diamond;
@@ -55,6 +56,8 @@ pub struct Options {
     pub tolerance_pixels: f64,
     /// What heights are multiplied by, and errors with them.
     pub exaggeration: f64,
+    /// How errors count on the screen.
+    pub sight: Sight,
     /// Memory for surfaces, in bytes. What the cut wants takes at most three quarters of it: where that is
     /// too little for the tolerance, the largest errors are reduced first.
     pub memory_bytes: usize,
@@ -69,6 +72,7 @@ impl Default for Options {
         Self {
             tolerance_pixels: 1.0,
             exaggeration: 1.0,
+            sight: Sight::default(),
             memory_bytes: 512 << 20,
             encoding: ENCODING.to_owned(),
             fetch: fetch::Options::default(),
@@ -310,6 +314,7 @@ impl Terrain {
                 camera,
                 exaggeration: self.options.exaggeration,
                 tolerance_pixels: self.options.tolerance_pixels,
+                sight: self.options.sight,
                 memory_bytes: state.memory_bytes,
             };
             state.ideal = cut::choose(&ask, |d| state.index.get(d));

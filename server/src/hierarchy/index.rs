@@ -40,7 +40,7 @@ impl Build<'_> {
             written.fold((0, 0), |(n, sum): (u64, u64), t| (n + 1, sum + u64::from(t.bytes)));
         let metres = |level: u32, tally: Tally| {
             let own = tally.vertical * stats.quantum + stats.rounding;
-            let apart = if tally.outline { hypotenuse(forest, level, cell) } else { 0.0 };
+            let apart = if tally.outline { forest.hypotenuse(level, cell) } else { 0.0 };
             let compared = tally.vertical > 0.0 || tally.outline;
             if compared { up((own + apart) * slack) } else { 0.0 }
         };
@@ -92,12 +92,6 @@ impl Build<'_> {
         };
         (0..pages).into_par_iter().map(page).sum()
     }
-}
-
-/// The largest length of a micro-hypotenuse of a level, in metres.
-fn hypotenuse(forest: &Forest, level: u32, cell: [f64; 2]) -> f64 {
-    let [along, across] = forest.hypotenuse(level);
-    if across > 0.0 { (along * cell[0]).hypot(across * cell[1]) } else { along * cell[0].max(cell[1]) }
 }
 
 /// What the index says of each diamond: parents declare at least what their children do.
