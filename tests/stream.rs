@@ -140,7 +140,8 @@ fn fly_over_magenta(world: &World, faults: Faults, seed: u64) -> (usize, Vec<f64
     let options = terrain::Options { tolerance_pixels: 0.2, fetch, ..terrain::Options::default() };
     let mut terrain = Terrain::open(&format!("{}/scenes/world", proxy.address), options).unwrap();
     let path = steep_flight(terrain.scene());
-    let flight = Flight { frames: 300, frames_a_second: 30.0, size: [160, 120], pictures: None };
+    let flight =
+        Flight { frames: 300, frames_a_second: 30.0, size: [160, 120], pictures: None, patience: None };
     let (mut begun, mut unfinished, mut cuts) = (false, 0, Vec::new());
     headless::fly(&mut terrain, &path, &flight, &over_magenta(), &sharp(), |line, picture| {
         cuts.push(line.cut_ms);

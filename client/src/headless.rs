@@ -454,6 +454,8 @@ pub struct Flight {
     pub size: [u32; 2],
     /// A folder for a PNG of each frame.
     pub pictures: Option<PathBuf>,
+    /// Let each frame wait up to so long for data, so that what a flight takes follows from its path alone.
+    pub patience: Option<Duration>,
 }
 
 /// One frame of a flight: a line of the CSV.
@@ -531,7 +533,7 @@ impl FrameLine {
     }
 }
 
-/// Flies along a path while data stream in. No frame waits for them: each draws what is there. `each` sees
+/// Flies along a path while data stream in. Unless told to, no frame waits for them: each draws what is there. `each` sees
 /// every frame's line and picture as soon as it is drawn.
 ///
 /// # Errors
@@ -556,6 +558,10 @@ pub fn fly(
         let camera = path.camera(f64::from(frame) / f64::from((flight.frames - 1).max(1)), flight.size);
         let clock = Instant::now();
         let drawn = stretched(&camera, look.exaggeration);
+        if let Some(patience) = flight.patience {
+            terrain.settle(&drawn, patience);
+        }
+        let clock = flight.patience.map_or(clock, |_| Instant::now());
         let view = terrain.frame(&drawn);
         let cut_ms = clock.elapsed().as_secs_f64() * 1e3;
         let clock = Instant::now();

@@ -134,6 +134,10 @@ struct FlyArgs {
     /// Frames a second at most; 0: as fast as they can be drawn
     #[arg(long, default_value_t = 30.0, value_name = "N")]
     fps: f64,
+    /// Let each frame wait for its data, up to so many seconds: what a flight takes then follows from its path
+    /// alone, and flights can be compared
+    #[arg(long, value_name = "SECONDS")]
+    settle: Option<f64>,
     /// Write a line for each frame here (- for standard output)
     #[arg(long, value_name = "CSV")]
     csv: Option<PathBuf>,
@@ -362,6 +366,8 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
     if !(args.fps.is_finite() && args.fps >= 0.0) {
         return Err(Failure(2, format!("--fps {}: expected 0 or more", args.fps)));
     }
+    let patience = args.settle.map(Duration::try_from_secs_f64).transpose();
+    let patience = patience.map_err(|_| Failure(2, "--settle: expected seconds, 0 or more".to_owned()))?;
     let path = args.path.as_deref().map(FlightPath::read).transpose()?;
     let mut terrain = args.view.open()?;
     let path = path.unwrap_or_else(|| FlightPath::round(terrain.scene()));
@@ -385,6 +391,7 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
         frames_a_second: args.fps,
         size: args.view.size,
         pictures: args.pictures.clone(),
+        patience,
     };
     let (mut slowest_cut, mut draw_sum, mut last) = (0.0f64, 0.0, None);
     let mut failed = None;
