@@ -13,7 +13,8 @@ const PROTOCOL: &[(&str, &[&str])] = &[
     ("points", &["bintree", "bitree", "diamond", "rans"]),
     ("tin", &["bintree", "bitree", "diamond", "rans"]),
     ("index", &["bintree", "diamond", "wire"]),
-    ("message", &["bintree", "diamond", "points", "wire"]),
+    ("message", &["bintree", "diamond", "points", "wire", "zone"]),
+    ("zone", &["bintree", "diamond"]),
     ("wire", &[]),
 ];
 
