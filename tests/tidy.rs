@@ -36,7 +36,7 @@ const SERVER: &[(&str, &[&str])] = &[
     ("http", &["height", "store", "stream"]),
     ("sample", &[]),
     ("demo", &["hierarchy", "http", "ingest", "progress", "sample"]),
-    ("zone", &["ingest", "store"]),
+    ("zone", &["height", "inspect", "progress", "projection", "store"]),
     ("experiment", &["canvas", "ingest", "measure", "progress", "simplify"]),
 ];
 

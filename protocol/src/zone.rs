@@ -45,9 +45,6 @@ pub const ZONES_MAX: usize = 64;
 /// The most corners of a zone, over all its rings: some 400 kB of JSON.
 pub const CORNERS_MAX: usize = 10_000;
 
-/// The largest uncompressed blob: a header and a byte for each diamond.
-pub const BYTES_MAX: usize = 3 + DIAMONDS_MAX as usize;
-
 /// A zone as the scene's description tells it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Zone {
@@ -170,27 +167,28 @@ impl Mask {
         Self { forest, floor, levels: levels.collect() }
     }
 
-    /// A mask from the visibilities of the diamonds of its finest level, in their order, in 255ths. Coarser
-    /// diamonds have the largest of their children's.
-    ///
-    /// `finest` must hold one for each diamond of level [`Mask::levels`] less one, none below `floor`.
+    /// A mask from the visibilities of the diamonds of the forest's finest level, in their order, in 255ths, none
+    /// below `floor`. Coarser diamonds have the largest of their children's.
     #[must_use]
     pub fn saturated(forest: Forest, floor: u8, layers: usize, finest: Vec<u8>) -> Self {
-        let mut mask = Self::hidden(forest, floor, layers);
-        if let Some(last) = mask.levels.last_mut() {
-            *last = finest;
-        }
-        for level in (1..mask.levels.len()).rev() {
-            let (coarse, fine) = mask.levels.split_at_mut(level);
-            let coarse = &mut coarse[level - 1];
-            for (d, value) in forest.diamonds(level as u32).zip(&fine[0]) {
+        let told = told_levels(&forest, layers);
+        let mut levels = Vec::new();
+        let mut fine = finest;
+        for level in (0..forest.levels()).rev() {
+            let mut coarse = vec![floor; if level > 0 { count(&forest, level - 1) as usize } else { 0 }];
+            for (d, value) in forest.diamonds(level).zip(&fine).filter(|(_, value)| **value > floor) {
                 for parent in forest.parents(d) {
                     let parent = &mut coarse[slot(&forest, parent)];
                     *parent = (*parent).max(*value);
                 }
             }
+            if level < told {
+                levels.push(fine);
+            }
+            fine = coarse;
         }
-        mask
+        levels.reverse();
+        Self { forest, floor, levels }
     }
 
     /// How many levels have visibilities of their own.
@@ -261,6 +259,15 @@ pub fn told_levels(forest: &Forest, layers: usize) -> u32 {
         }
     }
     forest.levels()
+}
+
+/// The most bytes that the masks of layers with these forests can have: a header and a byte for each diamond told,
+/// little more than [`DIAMONDS_MAX`] in all.
+#[must_use]
+pub fn bytes_max(forests: &[Forest]) -> usize {
+    let told =
+        |forest: &Forest| (0..told_levels(forest, forests.len())).map(|l| count(forest, l)).sum::<u64>();
+    3 + forests.iter().map(told).sum::<u64>() as usize
 }
 
 /// The bytes of the masks of a scene's layers, which have one floor; at most [`LAYERS_MAX`].
@@ -351,7 +358,7 @@ mod tests {
             state ^= state << 17;
             state
         };
-        let last = told_levels(&forest, layers) - 1;
+        let last = forest.levels() - 1;
         // Most is hidden, in long stretches, as in a real mask.
         let hidden = dice() % 4;
         let finest = (0..count(&forest, last)).map(|i| {
@@ -404,7 +411,7 @@ mod tests {
                 }
             }
             let bytes = encode(std::slice::from_ref(&mask));
-            prop_assert!(bytes.len() <= BYTES_MAX);
+            prop_assert!(bytes.len() <= bytes_max(&[forest]));
             prop_assert_eq!(decode(&[forest], &bytes), Ok(vec![mask]));
         }
 
