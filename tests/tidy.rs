@@ -13,7 +13,8 @@ const PROTOCOL: &[(&str, &[&str])] = &[
     ("points", &["bintree", "bitree", "diamond", "rans"]),
     ("tin", &["bintree", "bitree", "diamond", "rans"]),
     ("index", &["bintree", "diamond", "wire"]),
-    ("message", &["bintree", "diamond", "points", "wire"]),
+    ("message", &["bintree", "diamond", "points", "wire", "zone"]),
+    ("zone", &["bintree", "diamond"]),
     ("wire", &[]),
 ];
 
@@ -35,7 +36,7 @@ const SERVER: &[(&str, &[&str])] = &[
     ("http", &["height", "store", "stream"]),
     ("sample", &[]),
     ("demo", &["hierarchy", "http", "ingest", "progress", "sample"]),
-    ("zone", &["ingest", "store"]),
+    ("zone", &["height", "inspect", "progress", "projection", "store"]),
     ("experiment", &["canvas", "ingest", "measure", "progress", "simplify"]),
 ];
 

@@ -246,6 +246,10 @@ pub struct PictureReport {
     /// at the point of its box that is nearest to the eye, though no nearer than the near plane. `null` in
     /// JSON if too little arrived to draw anything.
     pub largest_error_pixels: f64,
+    /// The zone that was asked for.
+    pub zone: Option<String>,
+    /// Whether the eye was in it: then errors, those told here too, count for what is seen of them from the zone.
+    pub zone_in_effect: bool,
     /// Whether all that was wanted arrived.
     pub complete: bool,
     /// Milliseconds to draw the finished picture.
@@ -309,6 +313,8 @@ fn report(
         exaggeration: look.exaggeration,
         asked_error_pixels: terrain.tolerance_pixels(),
         largest_error_pixels: view.error_pixels,
+        zone: terrain.zone().map(|zone| zone.name.clone()),
+        zone_in_effect: view.stats.zone_in_effect,
         complete: view.complete,
         milliseconds_a_frame,
     }
@@ -499,17 +505,19 @@ pub struct FrameLine {
     pub real_points: u64,
     /// Fictitious points deduced so far.
     pub fictitious_points: u64,
+    /// Whether the eye was in the zone that was asked for: see [`PictureReport::zone_in_effect`].
+    pub zone_in_effect: bool,
 }
 
 impl FrameLine {
     /// The heading of the CSV.
-    pub const HEADING: &str = "frame,seconds,cut_ms,draw_ms,error_pixels,goal_pixels,complete,diamonds,triangles,draws,uploaded_bytes,gpu_bytes,resident,resident_bytes,bytes,requests,round_trips,real_points,fictitious_points";
+    pub const HEADING: &str = "frame,seconds,cut_ms,draw_ms,error_pixels,goal_pixels,complete,diamonds,triangles,draws,uploaded_bytes,gpu_bytes,resident,resident_bytes,bytes,requests,round_trips,real_points,fictitious_points,zone_in_effect";
 
     /// The line, with the fields of the heading.
     #[must_use]
     pub fn csv(&self) -> String {
         format!(
-            "{},{:.4},{:.3},{:.3},{:.4},{:.4},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+            "{},{:.4},{:.3},{:.3},{:.4},{:.4},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
             self.frame,
             self.seconds,
             self.cut_ms,
@@ -529,6 +537,7 @@ impl FrameLine {
             self.round_trips,
             self.real_points,
             self.fictitious_points,
+            self.zone_in_effect,
         )
     }
 }
@@ -588,6 +597,7 @@ pub fn fly(
             round_trips: view.stats.traffic.round_trips,
             real_points: view.stats.points_real,
             fictitious_points: view.stats.points_fictitious,
+            zone_in_effect: view.stats.zone_in_effect,
         };
         if let Some(folder) = &flight.pictures {
             save(&picture, &folder.join(format!("frame-{frame:05}.png")))?;
@@ -726,6 +736,7 @@ mod tests {
             round_trips: 10,
             real_points: 11,
             fictitious_points: 12,
+            zone_in_effect: true,
         };
         assert_eq!(line.csv().split(',').count(), FrameLine::HEADING.split(',').count());
         let json = serde_json::to_value(&line).unwrap();

@@ -55,6 +55,10 @@ struct ViewArgs {
     /// How diamonds are encoded
     #[arg(long, default_value = "points", value_enum)]
     encoding: Encoding,
+    /// Ask for less where nothing is seen from this zone, while the eye is in it: errors in pixels, those reported
+    /// too, then count for what is seen of them
+    #[arg(long, value_name = "NAME")]
+    zone: Option<String>,
     /// Memory for decoded diamonds
     #[arg(long, default_value = "1024", value_name = "MIB")]
     memory: usize,
@@ -111,7 +115,7 @@ struct RenderArgs {
     /// Ask for the whole view in one request, the largest errors first: one round trip after the scene's
     /// description. Without --eye it is asked for as seen from a little farther away than it is then drawn, and
     /// more requests follow
-    #[arg(long)]
+    #[arg(long, conflicts_with = "zone")]
     stream: bool,
     /// Seconds to wait for data before drawing what is there
     #[arg(long, default_value_t = 60.0, value_name = "SECONDS")]
@@ -255,10 +259,12 @@ impl ViewArgs {
             memory_bytes: self.memory << 20,
             sight: Sight { vertical: !self.sphere_error, foveation: self.foveation },
             encoding,
+            zone: self.zone.clone(),
             ..terrain::Options::default()
         };
         Terrain::open(&self.url, options).map_err(|error| {
-            let wrong_use = matches!(error, TerrainError::Fetch(FetchError::Address { .. }));
+            let wrong_use =
+                matches!(error, TerrainError::Fetch(FetchError::Address { .. }) | TerrainError::Zone { .. });
             Failure(if wrong_use { 2 } else { 1 }, error.to_string())
         })
     }

@@ -21,8 +21,10 @@ use crate::sight::Sight;
 use crate::surface::Surface;
 use bytes::Bytes;
 use diamantina_protocol::diamond::Diamond;
+use diamantina_protocol::index::Entry;
 use diamantina_protocol::message::{Layer, Scene, StreamAsk, StreamView};
 use diamantina_protocol::points::DecodeError;
+use diamantina_protocol::zone::{Mask, Zone};
 use foldhash::fast::RandomState;
 use glam::DVec3;
 use std::collections::{HashMap, HashSet, VecDeque};
@@ -63,6 +65,8 @@ pub struct Options {
     pub memory_bytes: usize,
     /// How diamonds are encoded; only [`ENCODING`] so far.
     pub encoding: String,
+    /// The name of a zone: while the eye is in it, less is asked for where nothing is seen from there.
+    pub zone: Option<String>,
     /// How to fetch.
     pub fetch: fetch::Options,
 }
@@ -75,6 +79,7 @@ impl Default for Options {
             sight: Sight::default(),
             memory_bytes: 512 << 20,
             encoding: ENCODING.to_owned(),
+            zone: None,
             fetch: fetch::Options::default(),
         }
     }
@@ -98,6 +103,23 @@ pub enum TerrainError {
         offered: Vec<String>,
         /// The encoding asked for.
         asked: String,
+    },
+    /// There is no such zone.
+    #[error(
+        "scene '{scene}' has no zone '{asked}'{}",
+        if .zones.is_empty() {
+            "; it has none at all: compute one with `diamantina-server zone`".to_owned()
+        } else {
+            format!(": it has {}", .zones.join(", "))
+        }
+    )]
+    Zone {
+        /// The scene.
+        scene: String,
+        /// The zone asked for.
+        asked: String,
+        /// The zones that there are.
+        zones: Vec<String>,
     },
     /// Not a number of pixels.
     #[error("tolerance of {0} pixels: expected a number above 0")]
@@ -134,6 +156,8 @@ pub struct Stats {
     pub splits_drawn: usize,
     /// Things that have failed too often and rest before they are tried again.
     pub failed: usize,
+    /// Whether the last frame's eye was in the zone that was asked for.
+    pub zone_in_effect: bool,
     /// Seconds from opening to the first frame that drew something.
     pub first_picture_seconds: Option<f64>,
     /// Seconds from opening to the first frame whose error was within the tolerance.
@@ -181,6 +205,39 @@ pub struct Terrain {
     scene_changed: bool,
     opened: Instant,
     stats: Stats,
+    view: Option<ZoneView>,
+}
+
+/// What is seen from a zone.
+#[derive(Debug)]
+struct ZoneView {
+    zone: Zone,
+    /// Of each layer.
+    masks: Vec<Mask>,
+}
+
+impl ZoneView {
+    /// Fetches the masks of a zone, waiting for them.
+    fn fetch(fetcher: &Fetcher, scene: &Scene, name: &str) -> Result<Self, TerrainError> {
+        let zone = scene.zones.iter().find(|zone| zone.name == name).ok_or_else(|| TerrainError::Zone {
+            scene: scene.name.clone(),
+            asked: name.to_owned(),
+            zones: scene.zones.iter().map(|zone| zone.name.clone()).collect(),
+        })?;
+        Ok(Self { zone: zone.clone(), masks: fetcher.masks(name)? })
+    }
+
+    /// An entry of the index with its error as it counts from the zone. Such errors are saturated, too.
+    ///
+    /// What is hidden may seem higher by `angle` over its share, and no more, lest it rises above what hides it.
+    /// Where the tolerance, in radians, is larger than that angle, shares count for as much more.
+    fn weigh(&self, layer: usize, d: Diamond, entry: Entry, tolerance: f64) -> Entry {
+        let coarser = if self.zone.angle > 0.0 { (tolerance / self.zone.angle).max(1.0) } else { 1.0 };
+        let share = (self.masks[layer].share(d) * coarser).min(1.0);
+        #[allow(clippy::cast_possible_truncation, reason = "an error in f32 times at most 1")]
+        let error_metres = (f64::from(entry.error_metres) * share) as f32;
+        Entry { error_metres, ..entry }
+    }
 }
 
 #[derive(Debug)]
@@ -212,6 +269,7 @@ impl Terrain {
                 asked: options.encoding,
             });
         }
+        let view = options.zone.as_deref().map(|name| ZoneView::fetch(&fetcher, &scene, name)).transpose()?;
         let share = options.memory_bytes / scene.layers.len() / 4 * 3;
         let state = |layer: &Layer| LayerState {
             index: Index::new(layer.forest),
@@ -237,6 +295,7 @@ impl Terrain {
             scene_changed: false,
             opened,
             stats: Stats::default(),
+            view,
         })
     }
 
@@ -251,6 +310,12 @@ impl Terrain {
     #[must_use]
     pub fn scene_changed(&self) -> bool {
         self.scene_changed
+    }
+
+    /// The zone that was asked for.
+    #[must_use]
+    pub fn zone(&self) -> Option<&Zone> {
+        self.view.as_ref().map(|view| &view.zone)
     }
 
     /// The last thing that failed for good, in words.
@@ -308,6 +373,11 @@ impl Terrain {
         let mut view = FrameView { complete: true, ..FrameView::default() };
         let mut wishes = Vec::new();
         (self.stats.splits_ideal, self.stats.splits_drawn) = (0, 0);
+        // Heights that are multiplied, all of them, leave hidden what is hidden.
+        let eye = camera.eye.with_z(camera.eye.z / self.options.exaggeration);
+        let zone = self.view.as_ref().filter(|view| view.zone.contains(eye.to_array()));
+        self.stats.zone_in_effect = zone.is_some();
+        let tolerance = self.options.tolerance_pixels / camera.pixels_per_radian();
         for (number, state) in self.layers.iter_mut().enumerate() {
             let ask = Ask {
                 layer: &self.scene.layers[number],
@@ -317,7 +387,10 @@ impl Terrain {
                 sight: self.options.sight,
                 memory_bytes: state.memory_bytes,
             };
-            state.ideal = cut::choose(&ask, |d| state.index.get(d));
+            state.ideal = cut::choose(&ask, |d| {
+                let entry = state.index.get(d)?;
+                Some(zone.map_or(entry, |zone| zone.weigh(number, d, entry, tolerance)))
+            });
             let drawing = cut::draw(number, &ask, &state.ideal, |d| self.cache.get((number, d)).cloned());
             self.stats.splits_ideal += state.ideal.len();
             self.stats.splits_drawn += drawing.splits;

@@ -293,6 +293,12 @@ impl Block {
         if p.is_multiple_of(2) { q / 2 * (n + 1) + p / 2 } else { (n + 1) * (n + 1) + q / 2 * n + p / 2 }
     }
 
+    /// The height at doubled local coordinates, as for [`Block::slot`].
+    #[must_use]
+    pub fn height(&self, [p, q]: [usize; 2]) -> i32 {
+        self.heights[Self::slot(self.n, p, q)]
+    }
+
     /// Doubled local coordinates of every point of the block's square, row by row.
     pub fn places(&self) -> impl Iterator<Item = [usize; 2]> + use<> {
         let (n, step) = (self.n, if self.has_centres() { 1 } else { 2 });

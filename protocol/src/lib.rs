@@ -11,6 +11,7 @@
 //! | [`rans`] | the entropy coder under [`points`] |
 //! | [`index`] | pages of errors, heights and sizes, from which a client knows the cut |
 //! | [`message`] | routes, catalogue, batch frames |
+//! | [`zone`] | regions where the viewer stays, and how much of each diamond is seen from there |
 //! | [`wire`] | the one place that knows the serialisation crate |
 //!
 //! **Units and axes, which both ends obey.** Lattice coordinates are integers: x counts samples to the
@@ -26,6 +27,7 @@ pub mod message;
 pub mod points;
 pub mod rans;
 pub mod wire;
+pub mod zone;
 
 /// The height of a point that has none.
 pub const NODATA: i32 = i32::MIN;

@@ -11,6 +11,7 @@
 use crate::bintree::{Forest, Point};
 use crate::points::Coding;
 use crate::wire::{self, WireError};
+use crate::zone::Zone;
 use serde::{Deserialize, Serialize};
 use std::fmt::Write as _;
 
@@ -41,9 +42,9 @@ pub struct Scene {
     pub frame: Frame,
     /// The surfaces over the frame.
     pub layers: Vec<Layer>,
-    /// Names of the regions with a visibility mask.
+    /// The regions with a visibility mask.
     #[serde(default)]
-    pub zones: Vec<String>,
+    pub zones: Vec<Zone>,
 }
 
 /// The planar coordinate system of a scene. Coordinates are metres, x east, y north, heights up.
@@ -180,6 +181,12 @@ pub fn scene_route(scene: &str) -> String {
 #[must_use]
 pub fn index_route(scene: &str, version: &str, layer: &str, page: u32) -> String {
     format!("/scenes/{scene}/{version}/{layer}/index/{page}")
+}
+
+/// The path of a zone's masks.
+#[must_use]
+pub fn zone_route(scene: &str, version: &str, zone: &str) -> String {
+    format!("/scenes/{scene}/{version}/zones/{zone}")
 }
 
 /// The path of one diamond.

@@ -6,7 +6,7 @@
 //! batches and heights leave the async threads.
 
 use crate::height::{self, HeightError};
-use crate::store::{Key, Kind, Store, StoreError};
+use crate::store::{Key, Kind, Store, StoreError, zones};
 use crate::stream::Stream;
 use axum::Router;
 use axum::body::{Body, Bytes};
@@ -192,6 +192,7 @@ pub fn router(scenes: Scenes) -> Router {
         .route("/scenes", get(catalogue))
         .route("/scenes/{scene}", get(scene))
         .route("/scenes/{scene}/{layer}/height", get(height_at))
+        .route("/scenes/{scene}/{version}/zones/{zone}", get(zone))
         .route("/scenes/{scene}/{version}/{layer}/index/{page}", get(index_page))
         .route("/scenes/{scene}/{version}/{layer}/points", get(batch))
         .route("/scenes/{scene}/{version}/{layer}/points/{x}/{y}", get(diamond))
@@ -354,6 +355,19 @@ async fn index_page(
     let page: u32 = page.parse().map_err(|_| missing())?;
     let blob = store.get(Key { layer: number, kind: Kind::Index, a: page, b: 0 })?.ok_or_else(missing)?;
     Ok(tagged(&headers, &format!("{version}-{number}-i{page}"), IMMUTABLE, OCTETS, || blob.into()))
+}
+
+async fn zone(
+    State(scenes): State<Scenes>,
+    UrlPath((name, version, zone)): UrlPath<(String, String, String)>,
+    headers: HeaderMap,
+) -> Result<Response, Refusal> {
+    let store = find_version(&scenes, &name, &version)?;
+    let missing =
+        || Refusal::new(StatusCode::NOT_FOUND, "no such zone: the scene's description lists its zones");
+    let position = store.scene().zones.iter().position(|z| z.name == zone).ok_or_else(missing)?;
+    let blob = store.get(zones::key(position))?.ok_or_else(missing)?;
+    Ok(tagged(&headers, &format!("{version}-z{position}"), IMMUTABLE, OCTETS, || blob.into()))
 }
 
 async fn diamond(

@@ -1,14 +1,16 @@
 //! What a store holds: levels, bytes, errors; and, on request, whether every blob is intact.
 
 use crate::chunks::Chunks;
-use crate::store::{Key, Kind, Store, StoreError};
+use crate::store::{Key, Kind, Store, StoreError, zones};
 use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::index::{self, Entry, PageError};
 use diamantina_protocol::message::{Layer, Scene};
 use diamantina_protocol::points::{self, DecodeError, Tally};
+use diamantina_protocol::zone::{self, Mask};
 use rayon::prelude::*;
 use serde::Serialize;
 use std::collections::HashMap;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Base-2 logarithm of the side of the chunks that are verified at once: some tens of megabytes each.
 const VERIFY_CHUNK_LOG2: u32 = 10;
@@ -76,6 +78,14 @@ pub enum InspectError {
         centre: [u32; 2],
         /// Why not.
         error: DecodeError,
+    },
+    /// The masks of a zone are missing or wrong.
+    #[error("zone '{zone}': {what}; compute it again with --replace")]
+    Zone {
+        /// The zone.
+        zone: String,
+        /// What is wrong.
+        what: String,
     },
     /// Something is in the store that nobody asks for.
     #[error("layer {layer}: {count} blobs belong to no diamond; build the store again")]
@@ -185,6 +195,7 @@ pub fn inspect(store: &Store, verify: bool) -> Result<Inspection, InspectError> 
         for (key, bytes) in store.keys().filter(|(key, _)| key.layer == number) {
             match key.kind {
                 Kind::Index => index_bytes += u64::from(bytes),
+                Kind::Zone => {}
                 Kind::Points => {
                     let known = layer.forest.diamond([key.a, key.b]).and_then(|d| entries.get(&d));
                     match known {
@@ -209,7 +220,25 @@ pub fn inspect(store: &Store, verify: bool) -> Result<Inspection, InspectError> 
         let tally = if verify { Some(verify_layer(store, number, layer, &entries)?) } else { None };
         layers.push(summary(layer, &entries, index_bytes, tally));
     }
+    for position in 0..if verify { store.scene().zones.len() } else { 0 } {
+        masks(store, position)?;
+    }
     Ok(Inspection { scene: store.scene().clone(), layers, verified: verify })
+}
+
+/// The masks of the zone at a position in the scene, one a layer.
+///
+/// # Errors
+/// When they are missing or damaged.
+pub fn masks(store: &Store, position: usize) -> Result<Vec<Mask>, InspectError> {
+    let scene = store.scene();
+    let name = scene.zones.get(position).map_or_else(String::new, |zone| zone.name.clone());
+    let wrong = |what: String| InspectError::Zone { zone: name.clone(), what };
+    let blob = store.get(zones::key(position))?.ok_or_else(|| wrong("its masks are missing".to_owned()))?;
+    let forests: Vec<_> = scene.layers.iter().map(|layer| layer.forest).collect();
+    let bytes = zstd::bulk::decompress(&blob, zone::bytes_max(&forests))
+        .map_err(|e| wrong(format!("its masks do not decompress ({e})")))?;
+    zone::decode(&forests, &bytes).map_err(|e| wrong(e.to_string()))
 }
 
 fn summary(
@@ -304,27 +333,62 @@ fn verify_layer(
     entries: &HashMap<Diamond, Entry>,
 ) -> Result<(u64, u64), InspectError> {
     let payloads = Payloads { store, number, layer, entries };
-    let forest = &layer.forest;
-    let chunks = Chunks::new(*forest, VERIFY_CHUNK_LOG2);
-    let add = |sum: (u64, u64), t: &Tally| (sum.0 + u64::from(t.real), sum.1 + u64::from(t.fictitious));
-    let (mut sum, mut coarse) = ((0, 0), HashMap::new());
+    let chunks = Chunks::new(layer.forest, VERIFY_CHUNK_LOG2);
+    let (real, fictitious) = (AtomicU64::new(0), AtomicU64::new(0));
+    by_chunks(&payloads, &chunks, |corner, decoded| {
+        let owned = decoded.iter().filter(|(d, _, _)| corner.is_none_or(|corner| chunks.owns(corner, *d)));
+        for (_, _, tally) in owned {
+            real.fetch_add(u64::from(tally.real), Ordering::Relaxed);
+            fictitious.fetch_add(u64::from(tally.fictitious), Ordering::Relaxed);
+        }
+    })?;
+    Ok((real.into_inner(), fictitious.into_inner()))
+}
+
+/// Decodes a layer, chunk by chunk, and shows the blocks of its finest level to `visit`, some more than once and
+/// in any order: their heights are those of every sample. Takes some 50 MB a thread besides the index.
+///
+/// # Errors
+/// When the index or a payload is missing or damaged.
+pub fn decode_finest(
+    store: &Store,
+    number: u8,
+    layer: &Layer,
+    visit: impl Fn(&[(Diamond, Block, Tally)]) + Sync,
+) -> Result<(), InspectError> {
+    let entries = entries(store, number, layer)?;
+    let payloads = Payloads { store, number, layer, entries: &entries };
+    let chunks = Chunks::new(layer.forest, VERIFY_CHUNK_LOG2);
+    by_chunks(&payloads, &chunks, |_, decoded| {
+        if decoded.first().is_some_and(|(d, _, _)| d.level() + 1 == layer.forest.levels()) {
+            visit(decoded);
+        }
+    })
+}
+
+/// Decodes a layer level by level: the coarse levels, then each chunk, many at once. `visit` sees what was
+/// decoded of a level, and in which chunk.
+fn by_chunks(
+    payloads: &Payloads<'_>,
+    chunks: &Chunks,
+    visit: impl Fn(Option<[u32; 2]>, &[(Diamond, Block, Tally)]) + Sync,
+) -> Result<(), InspectError> {
+    let forest = &payloads.layer.forest;
+    let mut coarse = HashMap::new();
     for level in 0..chunks.level() {
         let decoded = payloads.decode(forest.diamonds(level).collect::<Vec<_>>(), &coarse)?;
-        sum = decoded.iter().map(|(_, _, tally)| tally).fold(sum, add);
+        visit(None, &decoded);
         coarse = blocks(decoded);
     }
-    let one = |corner: [u32; 2]| -> Result<(u64, u64), InspectError> {
-        let (mut sum, mut before) = ((0, 0), None);
+    chunks.corners().into_par_iter().try_for_each(|corner| {
+        let mut before = None;
         for diamonds in chunks.needed(corner) {
             let decoded = payloads.decode(diamonds, before.as_ref().unwrap_or(&coarse))?;
-            let owned = decoded.iter().filter(|(d, _, _)| chunks.owns(corner, *d));
-            sum = owned.map(|(_, _, tally)| tally).fold(sum, add);
+            visit(Some(corner), &decoded);
             before = Some(blocks(decoded));
         }
-        Ok(sum)
-    };
-    let rest = chunks.corners().into_par_iter().map(one);
-    rest.try_reduce(|| (0, 0), |a, b| Ok((a.0 + b.0, a.1 + b.1))).map(|rest| (sum.0 + rest.0, sum.1 + rest.1))
+        Ok(())
+    })
 }
 
 /// Decodes a layer level by level and shows each level's blocks to `visit`, coarse to fine. For scenes

@@ -15,3 +15,4 @@ pub mod projection;
 pub mod sample;
 pub mod store;
 pub mod stream;
+pub mod zone;

@@ -8,6 +8,8 @@ use diamantina_server::ingest::IngestError;
 use diamantina_server::inspect::{self, Inspection};
 use diamantina_server::progress::Progress;
 use diamantina_server::store::{Store, StoreError};
+use diamantina_server::zone::polygon::Coordinates;
+use diamantina_server::zone::{self, ZoneError};
 use diamantina_server::{curve, demo, http, ingest};
 use std::io::{IsTerminal, Write};
 use std::net::SocketAddr;
@@ -33,6 +35,8 @@ enum Command {
     Serve(ServeArgs),
     /// Say what a store holds
     Inspect(InspectArgs),
+    /// Compute what is seen from a region where the viewer stays, and add it to a store
+    Zone(Box<ZoneArgs>),
     /// Build a sample scene, serve it and render a picture of it
     Demo(DemoArgs),
     /// Ask a running server whether it is well (for container health checks)
@@ -126,6 +130,60 @@ struct InspectArgs {
 }
 
 #[derive(Args)]
+struct ZoneArgs {
+    /// The folder of the store
+    store: PathBuf,
+    /// The zone's name in addresses
+    #[arg(long, value_name = "NAME")]
+    name: String,
+    /// The region, as GeoJSON: a Polygon or MultiPolygon, alone or in features. Ground that slopes is better cut
+    /// into several polygons: each has its own ceiling
+    #[arg(long, value_name = "GEOJSON", required_unless_present = "remove")]
+    polygon: Option<PathBuf>,
+    /// What the polygon's numbers mean
+    #[arg(long, default_value = "auto", value_enum)]
+    coordinates: Coordinates,
+    /// How far above the highest ground of each polygon the eye may be
+    #[arg(long, value_name = "METRES", required_unless_present = "remove", allow_negative_numbers = true)]
+    eye: Option<f64>,
+    /// The least height of the ground in the polygons, where the scene has none, as of water
+    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
+    level: Option<f64>,
+    /// What the errors of hidden ground count for: 0 to below 1
+    #[arg(long, default_value_t = zone::HIDDEN, value_name = "SHARE", allow_negative_numbers = true)]
+    hidden: f64,
+    /// The angle of a pixel: errors grow no larger than what hides them allows. 0: all that is hidden counts for
+    /// --hidden, however little it is hidden
+    #[arg(long, default_value_t = zone::ANGLE, value_name = "RADIANS", allow_negative_numbers = true)]
+    angle: f64,
+    /// The least apparent width of a triangle that a ray must not miss
+    #[arg(long, default_value_t = zone::EPSILON, value_name = "RADIANS", allow_negative_numbers = true)]
+    epsilon: f64,
+    /// Between eyes along the contour [default: 4 cells, or more for 200 eyes at most]
+    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
+    spacing: Option<f64>,
+    /// Let the Earth's curvature hide what is far (with refraction, coefficient 0.13). The client draws a plane:
+    /// there, what lies behind the horizon is seen
+    #[arg(long)]
+    curvature: bool,
+    /// Replace a zone of this name
+    #[arg(long)]
+    replace: bool,
+    /// Remove the zone instead
+    #[arg(long, conflicts_with_all = ["polygon", "eye", "replace"])]
+    remove: bool,
+    /// The most memory to use
+    #[arg(long, default_value = "2GiB", value_name = "BYTES", value_parser = parse_bytes)]
+    memory: u64,
+    /// Threads [default: one a core]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
+    /// Print the report as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Args)]
 struct DemoArgs {
     /// The folder for the sample DEM, its store and the picture
     #[arg(long, default_value = "demo", value_name = "FOLDER")]
@@ -200,6 +258,7 @@ fn main() -> ExitCode {
         Command::Build(args) => build(*args),
         Command::Serve(args) => serve(&args.stores, args.listen),
         Command::Inspect(args) => inspect_store(&args),
+        Command::Zone(args) => compute_zone(*args),
         Command::Demo(args) => demonstrate(&args),
         Command::Health(args) => http::ask_health(args.address).map_err(|e| Failure(1, e)),
     };
@@ -282,10 +341,23 @@ fn build(args: BuildArgs) -> Result<(), Failure> {
         }
         return Ok(());
     }
+    // What a build replaces need not be a store that can be read.
+    let zones: Vec<String> = Store::open(&args.output)
+        .map(|s| s.scene().zones.iter().map(|z| z.name.clone()).collect())
+        .unwrap_or_default();
     let progress = Arc::new(Progress::new());
     stop_on_signals(&progress)?;
     let report = hierarchy::build(&source, &args.output, &options, &progress)
         .map_err(|e| refuse_build(&args.sources, &e))?;
+    if !zones.is_empty() {
+        let _ = writeln!(
+            std::io::stderr(),
+            "notice: the zones of the scene before are gone, since they told what was seen there ({}): compute them \
+             again with `diamantina-server zone {}`",
+            zones.join(", "),
+            args.output.display()
+        );
+    }
     let mut out = std::io::stdout().lock();
     if args.json {
         shown(writeln!(out, "{}", serde_json::to_string_pretty(&report)?))?;
@@ -452,10 +524,111 @@ fn print_inspection(out: &mut impl Write, i: &Inspection) -> std::io::Result<()>
             writeln!(out, "  {real} real points, {fictitious} fictitious")?;
         }
     }
+    for zone in &i.scene.zones {
+        let ceilings: Vec<String> = zone.parts.iter().map(|part| format!("{:.3}", part.ceiling)).collect();
+        writeln!(
+            out,
+            "zone {}: eye {} m, up to {} m, hidden counts for {}, {} bytes",
+            zone.name,
+            zone.eye,
+            ceilings.join(", "),
+            zone.hidden,
+            zone.bytes
+        )?;
+    }
     if i.verified {
         writeln!(out, "verified: every blob matches its checksum and decodes")?;
     }
     Ok(())
+}
+
+fn compute_zone(args: ZoneArgs) -> Result<(), Failure> {
+    let mut out = std::io::stdout().lock();
+    if args.remove {
+        let scene = zone::remove(&args.store, &args.name).map_err(|e| refuse_zone(&e))?;
+        let what = if args.json {
+            serde_json::to_string_pretty(&scene.zones)?
+        } else {
+            format!("{}: zone '{}' is gone; version {}", args.store.display(), args.name, scene.version)
+        };
+        return Ok(shown(writeln!(out, "{what}"))?);
+    }
+    if let Some(threads) = args.threads {
+        rayon::ThreadPoolBuilder::new().num_threads(threads.into()).build_global()?;
+    }
+    let options = zone::Options {
+        name: args.name,
+        polygon: args.polygon.unwrap_or_default(),
+        coordinates: args.coordinates,
+        eye: args.eye.unwrap_or_default(),
+        level: args.level,
+        hidden: args.hidden,
+        angle: args.angle,
+        epsilon: args.epsilon,
+        spacing: args.spacing,
+        curvature: args.curvature,
+        replace: args.replace,
+        memory: args.memory,
+    };
+    let progress = Arc::new(Progress::new());
+    stop_on_signals(&progress)?;
+    let report = zone::add(&args.store, &options, &progress).map_err(|e| refuse_zone(&e))?;
+    if args.json {
+        shown(writeln!(out, "{}", serde_json::to_string_pretty(&report)?))?;
+    } else {
+        shown(print_zone(&mut out, &args.store, &report))?;
+    }
+    Ok(())
+}
+
+/// Options that make no sense, or not for this store, are wrong use; all else is failure.
+fn refuse_zone(error: &ZoneError) -> Failure {
+    let code = match error {
+        ZoneError::Interrupted => INTERRUPTED,
+        ZoneError::Option { .. }
+        | ZoneError::Exists { .. }
+        | ZoneError::Unknown { .. }
+        | ZoneError::Eyes { .. }
+        | ZoneError::Memory { .. } => 2,
+        _ => 1,
+    };
+    Failure(code, error.to_string())
+}
+
+fn print_zone(out: &mut impl Write, store: &Path, r: &zone::Report) -> std::io::Result<()> {
+    let share = |some: u64, all: u64| 100.0 * some as f64 / all.max(1) as f64;
+    writeln!(
+        out,
+        "{}: scene '{}', version {} (was {})",
+        store.display(),
+        r.scene,
+        r.version,
+        r.version_before
+    )?;
+    writeln!(
+        out,
+        "  zone '{}': {} polygons, up to {:.3} m, {} eyes {:.1} m apart, {} azimuths",
+        r.zone.name,
+        r.zone.parts.len(),
+        r.zone.parts.iter().map(|part| part.ceiling).fold(f64::NEG_INFINITY, f64::max),
+        r.eyes,
+        r.spacing,
+        r.azimuths
+    )?;
+    writeln!(
+        out,
+        "  {:.1} % of {} samples are seen, {:.1} % are hidden; of {} diamonds {:.1} % are hidden",
+        share(r.samples_seen, r.samples),
+        r.samples,
+        share(r.samples_hidden, r.samples),
+        r.diamonds,
+        share(r.diamonds_hidden, r.diamonds)
+    )?;
+    writeln!(
+        out,
+        "  {} bytes; {:.1} s: heights {:.1} s, rays {:.1} s",
+        r.zone.bytes, r.seconds, r.seconds_reading, r.seconds_casting
+    )
 }
 
 fn demonstrate(args: &DemoArgs) -> Result<(), Failure> {

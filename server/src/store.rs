@@ -6,6 +6,7 @@
 //! STORE/<version>/pack-00000     blobs in the order in which a viewer descends
 //! STORE/.lock                    held by the one build that may write
 //! STORE/.building                a build's work folder; an interrupted build goes on with it
+//! STORE/.zoning                  the next version while its zones are written: see [`zones`]
 //! ```
 //!
 //! `<version>` is a hash of the directory (which holds every blob's checksum) and of the scene, so any
@@ -28,6 +29,8 @@
 //! | 24 + 32 i | 4 | pack | below the number of packs |
 //! | 28 + 32 i | 4 + 4 | offset in the pack, bytes | inside the pack |
 //! | 36 + 32 i | 8 | XXH3 of the blob | |
+
+pub mod zones;
 
 use bytes::Bytes;
 use diamantina_protocol::message::Scene;
@@ -81,6 +84,8 @@ pub enum Kind {
     Index,
     /// The points of a diamond.
     Points,
+    /// A zone's masks, zstd-compressed; the key has layer 255 and the zone's position in the scene.
+    Zone,
 }
 
 /// Why a store could not be written or read.
@@ -102,7 +107,7 @@ pub enum StoreError {
     )]
     NotAStore(PathBuf),
     /// Another build holds the lock.
-    #[error("{0}: another build is writing this store: wait for it, or choose another folder with -o")]
+    #[error("{0}: another program is writing this store: wait for it, or choose another folder")]
     Busy(PathBuf),
     /// The folder holds what no build left there.
     #[error(
@@ -131,6 +136,28 @@ pub enum StoreError {
         path: PathBuf,
         /// The format found.
         found: u32,
+    },
+    /// The description would be too long to be read again.
+    #[error(
+        "{path}: {SCENE_FILE} would have {found} bytes, at most {SCENE_BYTES_MAX}: give its zones fewer corners"
+    )]
+    Description {
+        /// The store.
+        path: PathBuf,
+        /// Bytes.
+        found: usize,
+    },
+    /// A blob is larger than any that is read.
+    #[error(
+        "{path}: the masks of zone '{zone}' have {found} bytes, at most {BLOB_BYTES_MAX}: give it a larger --hidden"
+    )]
+    Blob {
+        /// The store.
+        path: PathBuf,
+        /// The zone.
+        zone: String,
+        /// Bytes.
+        found: usize,
     },
     /// The content does not match its hashes.
     #[error("{path}: damaged: {what}; build the store again, or copy it again from where it is intact")]
@@ -172,7 +199,7 @@ fn foreign(root: &Path) -> Option<String> {
     let built_here = names.iter().any(|name| name == LOCK_FILE);
     let is_version = |name: &str| name.len() == 16 && name.bytes().all(|b| b.is_ascii_hexdigit());
     names.into_iter().find(|name| match name.as_str() {
-        LOCK_FILE | WORK_FOLDER | "lost+found" => false,
+        LOCK_FILE | WORK_FOLDER | zones::WORK_FOLDER | "lost+found" => false,
         // A damaged description, and versions whose build was killed before it was there.
         SCENE_FILE => !built_here,
         other => !(built_here && is_version(other)),
@@ -216,6 +243,7 @@ fn kind_code(kind: Kind) -> u8 {
     match kind {
         Kind::Index => 1,
         Kind::Points => 2,
+        Kind::Zone => 16,
     }
 }
 
@@ -249,6 +277,7 @@ fn read_directory(bytes: &[u8], pack_bytes: &[u64]) -> Result<Vec<(Key, Place)>,
         let kind = match e[1] {
             1 => Kind::Index,
             2 => Kind::Points,
+            16 => Kind::Zone,
             other => return Err(format!("directory has a blob of kind {other}")),
         };
         let key = Key { layer: e[0], kind, a: number(4), b: number(8) };
@@ -314,17 +343,7 @@ impl Writer {
             return Err(StoreError::Foreign { path: root.to_owned(), found });
         }
         fs::create_dir_all(root).map_err(io_at("create the folder", root))?;
-        let lock_path = root.join(LOCK_FILE);
-        let lock = File::options()
-            .create(true)
-            .append(true)
-            .open(&lock_path)
-            .map_err(io_at("create", &lock_path))?;
-        match lock.try_lock() {
-            Ok(()) => {}
-            Err(fs::TryLockError::WouldBlock) => return Err(StoreError::Busy(root.to_owned())),
-            Err(fs::TryLockError::Error(error)) => return Err(io_at("lock", &lock_path)(error)),
-        }
+        let lock = lock(root)?;
         // Whoever left something here is gone, since the lock was free.
         let gone = root.join(GONE_FOLDER);
         if gone.exists() {
@@ -440,11 +459,7 @@ impl Writer {
     ///
     /// # Errors
     /// When the disk is full or fails: the old scene, if any, is then untouched.
-    pub fn publish(
-        &self,
-        mut scene: Scene,
-        go_on: impl Fn(u64) -> bool,
-    ) -> Result<Option<Scene>, StoreError> {
+    pub fn publish(&self, scene: Scene, go_on: impl Fn(u64) -> bool) -> Result<Option<Scene>, StoreError> {
         let mut spool = self.spool();
         let spool_path = self.work.join("spool");
         spool.file.flush().map_err(io_at("write", &spool_path))?;
@@ -457,25 +472,52 @@ impl Writer {
         fs::create_dir(&data).map_err(io_at("create the folder", &data))?;
         let packed = lay_packs(spool.file.get_ref(), &spool_path, &spool.blobs, &data, go_on)?;
         let Some((mut entries, pack_bytes)) = packed else { return Ok(None) };
-        entries.sort_unstable_by_key(|(key, _)| *key);
-        let directory = directory_bytes(&entries);
-        write_synced(&data.join("directory"), &directory)?;
-        let directory_hash = blake3::hash(&directory).to_hex().to_string();
-        scene.version = String::new();
-        let mut manifest = Manifest { format: FORMAT, directory_hash, pack_bytes, scene };
-        manifest.scene.version = manifest.version();
-        sync_folder(&data)?;
-        move_into_place(&data, &self.root.join(&manifest.scene.version))?;
-        sync_folder(&self.root)?;
-        let json = serde_json::to_vec_pretty(&manifest).unwrap_or_default();
-        let fresh = self.work.join(SCENE_FILE);
-        write_synced(&fresh, &json)?;
-        let current = self.root.join(SCENE_FILE);
-        fs::rename(&fresh, &current).map_err(io_at("publish", &current))?;
-        sync_folder(&self.root)?;
-        remove_others(&self.root, &manifest.scene.version);
-        Ok(Some(manifest.scene))
+        make_current(&self.root, &self.work, &mut entries, pack_bytes, scene).map(Some)
     }
+}
+
+/// The right to write a store, until dropped.
+fn lock(root: &Path) -> Result<File, StoreError> {
+    let path = root.join(LOCK_FILE);
+    let file = File::options().create(true).append(true).open(&path).map_err(io_at("create", &path))?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(fs::TryLockError::WouldBlock) => Err(StoreError::Busy(root.to_owned())),
+        Err(fs::TryLockError::Error(error)) => Err(io_at("lock", &path)(error)),
+    }
+}
+
+/// Completes the version whose packs lie in the folder `data` of `work`, moves it into place and makes it
+/// current, atomically; folders of other versions are removed. The result is the scene with its version.
+fn make_current(
+    root: &Path,
+    work: &Path,
+    entries: &mut [(Key, Place)],
+    pack_bytes: Vec<u64>,
+    mut scene: Scene,
+) -> Result<Scene, StoreError> {
+    let data = work.join("data");
+    entries.sort_unstable_by_key(|(key, _)| *key);
+    let directory = directory_bytes(entries);
+    write_synced(&data.join("directory"), &directory)?;
+    let directory_hash = blake3::hash(&directory).to_hex().to_string();
+    scene.version = String::new();
+    let mut manifest = Manifest { format: FORMAT, directory_hash, pack_bytes, scene };
+    manifest.scene.version = manifest.version();
+    let json = serde_json::to_vec_pretty(&manifest).unwrap_or_default();
+    if json.len() as u64 > SCENE_BYTES_MAX {
+        return Err(StoreError::Description { path: root.to_owned(), found: json.len() });
+    }
+    sync_folder(&data)?;
+    move_into_place(&data, &root.join(&manifest.scene.version))?;
+    sync_folder(root)?;
+    let fresh = work.join(SCENE_FILE);
+    write_synced(&fresh, &json)?;
+    let current = root.join(SCENE_FILE);
+    fs::rename(&fresh, &current).map_err(io_at("publish", &current))?;
+    sync_folder(root)?;
+    remove_others(root, &manifest.scene.version);
+    Ok(manifest.scene)
 }
 
 impl Drop for Writer {

@@ -80,6 +80,14 @@ pub enum FetchError {
         /// What is wrong with it.
         reason: String,
     },
+    /// The masks of a zone that are none.
+    #[error("zone '{zone}': {reason}: run `inspect --verify` at the server")]
+    Zone {
+        /// The zone.
+        zone: String,
+        /// What is wrong with them.
+        reason: String,
+    },
     /// The address names no scene and the server has several, or none.
     #[error("the address names no scene: add /scenes/NAME, with NAME one of: {}", .0.join(", "))]
     Choose(Vec<String>),

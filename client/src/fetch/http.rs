@@ -4,6 +4,7 @@ use super::{FetchError, TRIES_MAX, Traffic};
 use bytes::Bytes;
 use diamantina_protocol::index;
 use diamantina_protocol::message::{self, Catalogue, Layer, Scene};
+use diamantina_protocol::zone::{self, Mask};
 use reqwest::{Client, Response, StatusCode, Url};
 use std::hash::BuildHasher;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -20,6 +21,9 @@ const JSON_BYTES_MAX: usize = 4 << 20;
 
 /// The largest page of the index before and after decompression, in bytes.
 pub(super) const PAGE_BYTES_MAX: usize = 4 * index::PAGE_BYTES_MAX;
+
+/// The largest masks of a zone, compressed, in bytes: what a store may hold.
+const ZONE_BYTES_MAX: usize = 16 << 20;
 
 /// The most layers of a scene.
 pub const LAYERS_MAX: usize = 64;
@@ -75,6 +79,21 @@ fn check(scene: &Scene) -> Result<(), String> {
             || !layer.finest_error.is_finite()
         {
             return Err(format!("layer '{name}': numbers beyond all measure"));
+        }
+    }
+    if scene.zones.len() > zone::ZONES_MAX {
+        return Err(format!("{} zones, expected at most {}", scene.zones.len(), zone::ZONES_MAX));
+    }
+    for zone in &scene.zones {
+        let corners: usize = zone.parts.iter().flat_map(|part| &part.rings).map(Vec::len).sum();
+        let numbers =
+            zone.parts.iter().flat_map(|part| part.rings.iter().flatten().flatten().chain([&part.ceiling]));
+        let shares = (0.0..1.0).contains(&zone.hidden) && (0.0..=1.0).contains(&zone.angle);
+        if !message::is_name(&zone.name) || corners > zone::CORNERS_MAX || !shares {
+            return Err("a zone is none".into());
+        }
+        if !numbers.chain([&zone.eye]).all(|x| x.abs() < 1e12) {
+            return Err(format!("zone '{}': numbers beyond all measure", zone.name));
         }
     }
     Ok(())
@@ -154,6 +173,30 @@ impl Http {
             .map_err(|e| FetchError::Json { route: route.to_owned(), reason: e.to_string() })
     }
 
+    /// The masks of a scene's zone, one a layer.
+    pub(super) async fn masks(&self, scene: &Scene, zone: &str) -> Result<Vec<Mask>, FetchError> {
+        count(&self.traffic.round_trips, 1);
+        let route = message::zone_route(&scene.name, &scene.version, zone);
+        let mut tries = 0;
+        let blob = loop {
+            tries += 1;
+            match self.whole(&route, ZONE_BYTES_MAX).await {
+                Err(error) if tries < TRIES_MAX && is_passing(&error) => {
+                    count(&self.traffic.errors, 1);
+                    let asked =
+                        if let FetchError::Status { retry_after, .. } = error { retry_after } else { None };
+                    tokio::time::sleep(pause(tries, asked)).await;
+                }
+                answer => break answer?,
+            }
+        };
+        let wrong = |reason: String| FetchError::Zone { zone: zone.to_owned(), reason };
+        let forests: Vec<_> = scene.layers.iter().map(|layer| layer.forest).collect();
+        let bytes =
+            zstd::bulk::decompress(&blob, zone::bytes_max(&forests)).map_err(|e| wrong(e.to_string()))?;
+        zone::decode(&forests, &bytes).map_err(|e| wrong(e.to_string()))
+    }
+
     /// The description of the scene of this name, or of the only one.
     pub(super) async fn scene(&self, name: Option<&str>) -> Result<Scene, FetchError> {
         count(&self.traffic.round_trips, 1);
@@ -175,6 +218,11 @@ impl Http {
         check(&scene).map_err(|reason| FetchError::Scene { scene: shortened(&scene.name), reason })?;
         Ok(scene)
     }
+}
+
+/// Whether the same request may succeed a little later.
+fn is_passing(error: &FetchError) -> bool {
+    matches!(error, FetchError::Transport(_) | FetchError::Status { status: 429 | 500.., .. })
 }
 
 fn only(mut catalogue: Catalogue) -> Result<Scene, FetchError> {

@@ -36,6 +36,7 @@ use bytes::Bytes;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::Entry;
 use diamantina_protocol::message::{Scene, StreamAsk};
+use diamantina_protocol::zone::Mask;
 use foldhash::fast::RandomState;
 use http::{Counters, Http, parse_address};
 use reqwest::Client;
@@ -188,6 +189,23 @@ impl Fetcher {
             runtime.spawn(work(Arc::clone(&shared)));
         }
         Ok((Self { shared, events, seen: 0, runtime: Some(runtime) }, scene))
+    }
+
+    /// The masks of one of the scene's zones, one a layer; waits for them.
+    ///
+    /// # Errors
+    /// When they do not come, or are none.
+    pub fn masks(&self, zone: &str) -> Result<Vec<Mask>, FetchError> {
+        let stopped = || FetchError::Start("the runtime has ended".to_owned());
+        let runtime = self.runtime.as_ref().ok_or_else(stopped)?;
+        // Not block_on: the caller may stand in a runtime of its own.
+        let (sender, receiver) = mpsc::sync_channel(1);
+        let (shared, zone) = (Arc::clone(&self.shared), zone.to_owned());
+        runtime.spawn(async move {
+            // Whoever asked waits for this.
+            let _ = sender.send(shared.http.masks(&shared.scene, &zone).await);
+        });
+        receiver.recv().map_err(|_| stopped())?
     }
 
     /// The next event that has arrived, without waiting.

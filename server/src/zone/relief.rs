@@ -1,0 +1,185 @@
+//! The finest surface of a layer as a plain raster, with the highest and lowest sample of each block of it.
+
+use crate::inspect::{self, InspectError};
+use crate::store::Store;
+use diamantina_protocol::NODATA;
+use diamantina_protocol::message::Layer;
+use std::sync::{Mutex, PoisonError};
+
+/// Base-2 logarithms of the sides of blocks, in cells, from small to large.
+pub const BLOCKS_LOG2: [u32; 2] = [3, 6];
+
+/// Samples in rows from the south, with a pyramid of blocks.
+///
+/// Takes 4 bytes a sample and 1/8 more for the blocks.
+#[derive(Debug)]
+pub struct Relief {
+    size: [usize; 2],
+    heights: Vec<i32>,
+    blocks: [Blocks; 2],
+}
+
+/// The lowest and highest sample of each block, its borders included; those without height do not count.
+#[derive(Debug)]
+struct Blocks {
+    size: [usize; 2],
+    bounds: Vec<[i32; 2]>,
+}
+
+/// What a block without any height has: it lies below everything.
+const NOTHING: [i32; 2] = [i32::MAX, NODATA];
+
+impl Relief {
+    /// The relief of `size[0]` by `size[1]` samples, two at least along each axis; `heights` in quanta, row by row
+    /// from the south.
+    #[must_use]
+    pub fn new(size: [usize; 2], heights: Vec<i32>) -> Self {
+        let blocks = BLOCKS_LOG2.map(|log2| Blocks::new(size, &heights, log2));
+        Self { size, heights, blocks }
+    }
+
+    /// The finest surface of a layer, decoded chunk by chunk: some 100 MB at a time, besides the relief itself.
+    ///
+    /// # Errors
+    /// When the store is damaged.
+    pub fn read(store: &Store, number: u8, layer: &Layer) -> Result<Self, InspectError> {
+        let size = layer.samples.map(|s| s as usize);
+        let heights = Mutex::new(vec![NODATA; size[0] * size[1]]);
+        inspect::decode_finest(store, number, layer, |blocks| {
+            let mut heights = heights.lock().unwrap_or_else(PoisonError::into_inner);
+            for (d, block, _) in blocks {
+                let local = layer.forest.local(*d);
+                for [p, q] in block.places().filter(|[p, q]| local.upper || q <= p) {
+                    let at = local.lattice2([p, q].map(|w| i64::try_from(w).unwrap_or(0)));
+                    let [x, y] = at.map(|w| usize::try_from(w).unwrap_or(usize::MAX));
+                    if x < size[0] && y < size[1] {
+                        heights[y * size[0] + x] = block.height([p, q]);
+                    }
+                }
+            }
+        })?;
+        Ok(Self::new(size, heights.into_inner().unwrap_or_else(PoisonError::into_inner)))
+    }
+
+    /// Samples along x and y.
+    #[must_use]
+    pub fn size(&self) -> [usize; 2] {
+        self.size
+    }
+
+    /// Blocks of the smaller kind along x and y.
+    pub(super) fn blocks_size(&self) -> [usize; 2] {
+        self.blocks[0].size
+    }
+
+    /// The height of a sample.
+    #[must_use]
+    pub fn at(&self, [x, y]: [usize; 2]) -> i32 {
+        self.heights[y * self.size[0] + x]
+    }
+
+    /// Three corners of the small triangle at a place, in cells from the south-west sample and within the relief,
+    /// and what each of them counts for there. Diagonals alternate as in the bintree's finest lattice.
+    #[must_use]
+    #[allow(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "places lie within the relief, so they are above 0 and below the count of samples"
+    )]
+    pub fn triangle(&self, place: [f64; 2]) -> [([usize; 2], f64); 3] {
+        let [i, j]: [usize; 2] =
+            std::array::from_fn(|axis| (place[axis].max(0.0) as usize).min(self.size[axis] - 2));
+        let [s, t] = [place[0] - i as f64, place[1] - j as f64];
+        match ((i + j).is_multiple_of(2), s >= t, s + t <= 1.0) {
+            (true, true, _) => [([i, j], 1.0 - s), ([i + 1, j], s - t), ([i + 1, j + 1], t)],
+            (true, false, _) => [([i, j], 1.0 - t), ([i, j + 1], t - s), ([i + 1, j + 1], s)],
+            (false, _, true) => [([i, j], 1.0 - s - t), ([i + 1, j], s), ([i, j + 1], t)],
+            (false, _, false) => {
+                [([i + 1, j], 1.0 - t), ([i, j + 1], 1.0 - s), ([i + 1, j + 1], s + t - 1.0)]
+            }
+        }
+    }
+
+    /// The height of the surface at a place, in quanta; `None` where it is not drawn. The place as for
+    /// [`Relief::triangle`].
+    #[must_use]
+    pub fn height(&self, place: [f64; 2]) -> Option<f64> {
+        let corners = self.triangle(place).map(|(at, weight)| (self.at(at), weight));
+        let drawn = corners.iter().all(|(height, _)| *height != NODATA);
+        drawn.then(|| corners.iter().map(|(height, weight)| f64::from(*height) * weight).sum())
+    }
+
+    /// The lowest and highest sample of two neighbouring blocks or one; blocks number `which` of
+    /// [`BLOCKS_LOG2`]. None has a height where low > high.
+    #[must_use]
+    pub(super) fn bounds(&self, which: usize, [first, last]: [[usize; 2]; 2]) -> [i32; 2] {
+        let blocks = &self.blocks[which];
+        let at = |[x, y]: [usize; 2]| blocks.bounds[y * blocks.size[0] + x];
+        merged(at(first), at(last))
+    }
+}
+
+fn merged(a: [i32; 2], b: [i32; 2]) -> [i32; 2] {
+    [a[0].min(b[0]), a[1].max(b[1])]
+}
+
+impl Blocks {
+    fn new([width, height]: [usize; 2], heights: &[i32], log2: u32) -> Self {
+        let size = [width, height].map(|samples| (samples - 1).div_ceil(1 << log2));
+        let side = 1usize << log2;
+        let mut bounds = Vec::with_capacity(size[0] * size[1]);
+        for j in 0..size[1] {
+            let rows = j * side..=((j + 1) * side).min(height - 1);
+            for i in 0..size[0] {
+                let columns = i * side..=((i + 1) * side).min(width - 1);
+                let samples = rows
+                    .clone()
+                    .flat_map(|y| &heights[y * width + columns.start()..=y * width + columns.end()]);
+                let filled = samples.filter(|h| **h != NODATA);
+                bounds.push(filled.fold(NOTHING, |bounds, h| merged(bounds, [*h, *h])));
+            }
+        }
+        Self { size, bounds }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn blocks_bound_their_samples_and_borders() {
+        let (width, height) = (100usize, 70usize);
+        let of = |i: usize| i32::try_from(i * 7919 % 1013).unwrap();
+        let heights = (0..width * height).map(|i| if of(i) % 9 == 0 { NODATA } else { of(i) }).collect();
+        let relief = Relief::new([width, height], heights);
+        for (which, log2) in BLOCKS_LOG2.into_iter().enumerate() {
+            for y in 0..height - 1 {
+                for x in 0..width - 1 {
+                    let block = [x >> log2, y >> log2];
+                    let [low, high] = relief.bounds(which, [block, block]);
+                    let corners = [[x, y], [x + 1, y], [x, y + 1], [x + 1, y + 1]].map(|c| relief.at(c));
+                    assert!(corners.iter().all(|h| *h == NODATA || (low..=high).contains(h)));
+                }
+            }
+        }
+        let empty = Relief::new([9, 9], vec![NODATA; 81]);
+        assert_eq!(empty.bounds(0, [[0, 0], [0, 0]]), NOTHING);
+    }
+
+    #[test]
+    fn the_surface_passes_through_its_samples_and_bends_along_its_diagonals() {
+        let relief = Relief::new([3, 2], vec![0, 10, 20, 30, 40, NODATA]);
+        for (place, expected) in [
+            ([0.0, 0.0], Some(0.0)),
+            ([1.0, 1.0], Some(40.0)),
+            // The first cell rises along its diagonal, the second falls: its upper half is not drawn.
+            ([0.5, 0.5], Some(20.0)),
+            ([1.25, 0.25], Some(20.0)),
+            ([1.75, 0.75], None),
+            ([2.0, 0.0], Some(20.0)),
+        ] {
+            assert_eq!(relief.height(place), expected, "{place:?}");
+        }
+    }
+}
