@@ -157,6 +157,7 @@ fn any_cut_of_a_built_store_with_anything_missing_has_no_cracks() {
                 exaggeration: 1.0,
                 tolerance_pixels: 0.005 * 300f64.powf(dice.roll()),
                 sight: Sight { vertical: round % 2 == 0, foveation: if round % 3 == 0 { 4.0 } else { 1.0 } },
+                seen: None,
                 memory_bytes: if round % 7 == 6 { 40 * largest } else { usize::MAX },
             };
             let ideal = cut::choose(&ask, |d| Some(entries[&d]));

@@ -253,6 +253,7 @@ mod tests {
                 exaggeration: 1.0,
                 tolerance_pixels: 0.5,
                 sight: Sight::default(),
+                seen: None,
                 memory_bytes: 225 * size,
             };
             let ideal = choose(&ask, |d| Some(built.entries[&d]));

@@ -20,6 +20,7 @@ use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::{self, Entry};
 use diamantina_protocol::message::Layer;
+use diamantina_protocol::zone::Mask;
 use foldhash::fast::RandomState;
 use glam::DVec3;
 use std::cmp::Ordering;
@@ -42,8 +43,19 @@ pub struct Ask<'a> {
     pub tolerance_pixels: f64,
     /// How errors count on the screen.
     pub sight: Sight,
+    /// What counts of errors, while the eye is in a zone.
+    pub seen: Option<Seen<'a>>,
     /// Bytes that the surfaces of split diamonds may take; the roots are split in any case.
     pub memory_bytes: usize,
+}
+
+/// What is seen of a layer's diamonds from the zone that the eye is in.
+#[derive(Debug, Clone, Copy)]
+pub struct Seen<'a> {
+    /// The visibility of each diamond.
+    pub mask: &'a Mask,
+    /// How many times as much as that counts of an error, though no more than all; 1 or more.
+    pub coarser: f64,
 }
 
 impl Ask<'_> {
@@ -52,15 +64,22 @@ impl Ask<'_> {
         bounds(self.layer, d, entry).stretched(self.exaggeration)
     }
 
-    /// The largest apparent size, in pixels, of the error of triangles of a level anywhere in a box.
-    fn pixels(&self, level: u32, error_metres: f32, bounds: &Bounds) -> f64 {
+    /// What counts of the error of a diamond, 0 to 1: at most what counts of its parents'.
+    fn share(&self, d: Diamond) -> f64 {
+        self.seen.map_or(1.0, |seen| (seen.mask.share(d) * seen.coarser).min(1.0))
+    }
+
+    /// The largest apparent size, in pixels, of the error of triangles of a level anywhere in the box of a diamond, as
+    /// far as it counts.
+    fn pixels(&self, d: Diamond, level: u32, error_metres: f32, bounds: &Bounds) -> f64 {
         let layer = self.layer;
         // Where outlines differ, the length of a hypotenuse is part of the error; what is below it is of heights.
         let vertical = level >= layer.forest.levels()
             || f64::from(error_metres) < layer.forest.hypotenuse(level, layer.cell);
         // Heights pressed together leave the errors of outlines as they are.
         let stretch = if vertical { self.exaggeration } else { self.exaggeration.max(1.0) };
-        let error = sight::Error { metres: f64::from(error_metres) * stretch, vertical };
+        let error =
+            sight::Error { metres: f64::from(error_metres) * stretch, vertical, share: self.share(d) };
         self.sight.pixels(self.camera, error, bounds, nearest_drawn(layer.cell))
     }
 }
@@ -351,7 +370,7 @@ impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
         let entry = found.or(parent).unwrap_or_else(|| unknown(self.ask.layer));
         let bounds = self.ask.bounds(d, &entry);
         let in_view = !entry.is_empty() && bounds.touches(&self.planes);
-        let pixels = if in_view { self.ask.pixels(d.level(), entry.error_metres, &bounds) } else { 0.0 };
+        let pixels = if in_view { self.ask.pixels(d, d.level(), entry.error_metres, &bounds) } else { 0.0 };
         // Beyond the picture's height, more error is no worse.
         let priority = pixels.min(f64::from(self.ask.camera.size[1]));
         let number = u32::try_from(self.ideal.nodes.len()).unwrap_or(NONE);
@@ -398,7 +417,7 @@ impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
         self.ideal.finest_pixels.push(if finest {
             {
                 let (level, finest) = (self.forest.levels(), self.ask.layer.finest_error);
-                self.ask.pixels(level, finest, &self.ask.bounds(diamond, &entry))
+                self.ask.pixels(diamond, level, finest, &self.ask.bounds(diamond, &entry))
             }
         } else {
             0.0
@@ -492,6 +511,7 @@ mod tests {
             exaggeration: 1.0,
             tolerance_pixels,
             sight,
+            seen: None,
             memory_bytes: usize::MAX,
         }
     }
@@ -639,7 +659,7 @@ mod tests {
                     assert!(
                         entry.is_empty()
                             || !bounds.touches(&camera.planes())
-                            || ask.pixels(child.level(), entry.error_metres, &bounds) <= tolerance
+                            || ask.pixels(child, child.level(), entry.error_metres, &bounds) <= tolerance
                     );
                 }
             }

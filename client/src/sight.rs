@@ -42,6 +42,8 @@ pub struct Error {
     pub metres: f64,
     /// Whether heights alone err, and not outlines.
     pub vertical: bool,
+    /// What counts of it, 0 to 1: less than all where little is seen.
+    pub share: f64,
 }
 
 impl Sight {
@@ -56,7 +58,9 @@ impl Sight {
         if self.vertical && error.vertical {
             angle = angle.min(vertical_angle(camera.eye, error.metres, bounds));
         }
-        angle * camera.pixels_per_radian() * self.weight(camera, bounds)
+        // What is hidden must not rise above what hides it: that bounds it in all of the picture alike.
+        let counts = if error.share < 1.0 { error.share } else { self.weight(camera, bounds) };
+        angle * camera.pixels_per_radian() * counts
     }
 
     /// What errors of a box count for: 1 in the middle of the picture, less towards its corners and beyond.
@@ -159,7 +163,7 @@ mod tests {
             let (a, b) = (in_box(&outer, corners.0), in_box(&outer, corners.1));
             let inner = Bounds { min: a.min(b), max: a.max(b) };
             let camera = camera(DVec3::from_array(eye), DVec3::from_array(target));
-            let of = |metres| Error { metres, vertical: true };
+            let of = |metres| Error { metres, vertical: true, share: 1.0 };
             // Foveation takes spheres around boxes for boxes, and a box's may stick out of its parent's.
             for sight in [Sight::default(), Sight { vertical: false, foveation: 1.0 }] {
                 let (part, whole) = (
@@ -180,7 +184,7 @@ mod tests {
     fn seen_from_far_above_heights_hardly_move() {
         let bounds = Bounds { min: DVec3::new(-10.0, -10.0, 0.0), max: DVec3::new(10.0, 10.0, 5.0) };
         let camera = camera(DVec3::new(0.0, 0.0, 1005.0), DVec3::ZERO);
-        let error = Error { metres: 1.0, vertical: true };
+        let error = Error { metres: 1.0, vertical: true, share: 1.0 };
         let sphere = Sight { vertical: false, foveation: 1.0 }.pixels(&camera, error, &bounds, 0.05);
         let vertical = Sight::default().pixels(&camera, error, &bounds, 0.05);
         assert!(vertical < sphere / 50.0, "{vertical} and {sphere} pixels");
@@ -192,7 +196,7 @@ mod tests {
     fn seen_from_the_side_heights_move_as_spheres_do() {
         let bounds = Bounds { min: DVec3::new(-10.0, 1000.0, 0.0), max: DVec3::new(10.0, 1020.0, 50.0) };
         let camera = camera(DVec3::new(0.0, 0.0, 20.0), DVec3::new(0.0, 1000.0, 20.0));
-        let error = Error { metres: 1.0, vertical: true };
+        let error = Error { metres: 1.0, vertical: true, share: 1.0 };
         let sphere = Sight { vertical: false, foveation: 1.0 }.pixels(&camera, error, &bounds, 0.05);
         assert_eq!(Sight::default().pixels(&camera, error, &bounds, 0.05), sphere);
     }

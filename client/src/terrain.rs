@@ -14,14 +14,13 @@
 
 use crate::cache::{Cache, Index, Key, PAGES_MAX};
 use crate::camera::{Camera, Plane};
-use crate::cut::{self, Ask, Ideal, Wish};
+use crate::cut::{self, Ask, Ideal, Seen, Wish};
 use crate::drawing::DrawItem;
 use crate::fetch::{self, Event, FetchError, Fetcher, ROOT_BYTES, Traffic, Want};
 use crate::sight::Sight;
 use crate::surface::Surface;
 use bytes::Bytes;
 use diamantina_protocol::diamond::Diamond;
-use diamantina_protocol::index::Entry;
 use diamantina_protocol::message::{Layer, Scene, StreamAsk, StreamView};
 use diamantina_protocol::points::DecodeError;
 use diamantina_protocol::zone::{Mask, Zone};
@@ -227,16 +226,13 @@ impl ZoneView {
         Ok(Self { zone: zone.clone(), masks: fetcher.masks(name)? })
     }
 
-    /// An entry of the index with its error as it counts from the zone. Such errors are saturated, too.
+    /// What counts of a layer's errors.
     ///
     /// What is hidden may seem higher by `angle` over its share, and no more, lest it rises above what hides it.
     /// Where the tolerance, in radians, is larger than that angle, shares count for as much more.
-    fn weigh(&self, layer: usize, d: Diamond, entry: Entry, tolerance: f64) -> Entry {
+    fn seen(&self, layer: usize, tolerance: f64) -> Seen<'_> {
         let coarser = if self.zone.angle > 0.0 { (tolerance / self.zone.angle).max(1.0) } else { 1.0 };
-        let share = (self.masks[layer].share(d) * coarser).min(1.0);
-        #[allow(clippy::cast_possible_truncation, reason = "an error in f32 times at most 1")]
-        let error_metres = (f64::from(entry.error_metres) * share) as f32;
-        Entry { error_metres, ..entry }
+        Seen { mask: &self.masks[layer], coarser }
     }
 }
 
@@ -385,12 +381,10 @@ impl Terrain {
                 exaggeration: self.options.exaggeration,
                 tolerance_pixels: self.options.tolerance_pixels,
                 sight: self.options.sight,
+                seen: zone.map(|zone| zone.seen(number, tolerance)),
                 memory_bytes: state.memory_bytes,
             };
-            state.ideal = cut::choose(&ask, |d| {
-                let entry = state.index.get(d)?;
-                Some(zone.map_or(entry, |zone| zone.weigh(number, d, entry, tolerance)))
-            });
+            state.ideal = cut::choose(&ask, |d| state.index.get(d));
             let drawing = cut::draw(number, &ask, &state.ideal, |d| self.cache.get((number, d)).cloned());
             self.stats.splits_ideal += state.ideal.len();
             self.stats.splits_drawn += drawing.splits;

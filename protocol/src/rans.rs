@@ -23,7 +23,8 @@
 
 #![allow(
     clippy::cast_possible_truncation,
-    reason = "states are 32 bits, probabilities 12, words 16: each cast says so beside it"
+    clippy::cast_sign_loss,
+    reason = "states are 32 bits, probabilities 12, words 16: each cast says so beside it; costs are not negative"
 )]
 
 use std::sync::LazyLock;
