@@ -311,26 +311,25 @@ impl Sky<'_> {
         if self.optics.angle == 0.0 {
             return 0.0;
         }
-        let mut share = self.beside(hi, lo, self.horizon);
+        let mut share = self.beside(lo, hi, self.horizon);
         for [least, most] in &self.windows {
             let below = !is_above(hi, *least);
-            share = share.max(if below { self.beside(hi, lo, *least) } else { self.beside(lo, hi, *most) });
+            share = share.max(self.beside(lo, hi, if below { *least } else { *most }));
         }
         share.min(1.0)
     }
 
-    /// The same beside one border of what is open, from the slope that is nearer to it to the other. An error E at
-    /// the distance t and the slope s looks as large as E / (t √(1 + s²)) and changes the slope by E / t. Of all
-    /// slopes between two, one of both counts for the most: in between, the quotient has a least value, and only
-    /// where s times the border is below -1.
-    fn beside(&self, near: f64, far: f64, border: f64) -> f64 {
+    /// The same beside one border of what is open, for all slopes between two. A vertical error E at the distance t
+    /// and the slope s is seen as E / (t (1 + s²)) and changes the slope by E / t. Of all slopes between two, one of
+    /// both counts for the most: in between, the quotient has a least value, if any.
+    fn beside(&self, a: f64, b: f64, border: f64) -> f64 {
         let Optics { angle, quantum, .. } = *self.optics;
         let count = |slope: f64| {
             let gap = (border - slope).abs() * quantum;
-            // Far down, a slope and its distance from anything become the same.
-            if slope.is_infinite() { angle } else { angle * (1.0 + (slope * quantum).powi(2)).sqrt() / gap }
+            // Straight down, no vertical error is seen.
+            if slope.is_infinite() { 1.0 } else { angle * (1.0 + (slope * quantum).powi(2)) / gap }
         };
-        if far * border * quantum * quantum < -1.0 { count(near).max(count(far)) } else { count(near) }
+        count(a).max(count(b))
     }
 
     /// Closes the slopes between two.
@@ -458,12 +457,12 @@ impl<F: FnMut(Seen)> Walk<'_, F> {
         let plane = &self.plane;
         let corners = [[k, j], [k + 1, j], [k + 1, j + 1], [k, j + 1]].map(|c| plane.sample(c));
         let heights = corners.map(|c| plane.relief.at(c));
-        let [low, high] =
-            heights.iter().fold([i32::MAX, NODATA], |[low, high], h| [low.min(*h), high.max(*h)]);
+        let filled = heights.iter().filter(|h| **h != NODATA);
+        let [low, high] = filled.fold([i32::MAX, NODATA], |[low, high], h| [low.min(*h), high.max(*h)]);
         if high == NODATA {
             return;
         }
-        let bounds = [if low == NODATA { f64::NEG_INFINITY } else { f64::from(low) }, f64::from(high)];
+        let bounds = [f64::from(low), f64::from(high)];
         let slopes = plane.slopes(bounds, [from, to]);
         if !self.sky.shows(slopes) {
             let share = self.sky.share(slopes);

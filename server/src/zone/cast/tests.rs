@@ -253,9 +253,9 @@ proptest! {
             }
             let nearer: Vec<Cut> = cuts.iter().filter(|c| c.distance[0] < cut.distance[0]).cloned().collect();
             for (slope, distance) in cut.slopes.iter().zip(cut.distance) {
-                // The apparent size of the error is `angle / share`: how far does that raise the slope?
+                // The error is seen as `angle / share`: how far does that raise the slope?
                 let rise = slope * optics.quantum;
-                let error = angle / share * distance * (1.0 + rise * rise).sqrt();
+                let error = angle / share * distance * (1.0 + rise * rise);
                 let raised = slope + 0.999 * error / distance / optics.quantum;
                 let between = rays(&cuts).into_iter().filter(|(ray, width)| *width > GRAZING && (*slope..raised).contains(ray));
                 for (ray, _) in between {
