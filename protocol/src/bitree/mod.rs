@@ -263,6 +263,20 @@ impl Bitree {
         [roots.next().unwrap_or(nothing), roots.next().unwrap_or(nothing)]
     }
 
+    /// The triangle of a path, see [`Facet::path`]; `None` out of its range. Costs one step a level.
+    #[must_use]
+    pub fn facet(&self, path: u32) -> Option<Facet> {
+        if path < 2 || path as usize >= 2 * self.below.len() {
+            return None;
+        }
+        let level = path.ilog2() - 1;
+        let mut facet = self.roots()[(path >> level & 1) as usize];
+        for step in (0..level).rev() {
+            facet = self.halves(&facet)[(path >> step & 1) as usize];
+        }
+        Some(facet)
+    }
+
     /// What a triangle splits into, left then right, whether it is split or not. Not for the finest ones,
     /// of level 2 k, which have no middle on the grid.
     #[must_use]
@@ -487,6 +501,7 @@ mod tests {
                 for facet in bitree.around(*p).into_iter().flatten() {
                     needed.insert(*p);
                     // Its apex is the middle of the triangle that it came from, and so on up.
+                    prop_assert_eq!(bitree.facet(facet.path), Some(facet));
                     let mut at = bitree.roots().into_iter().find(|r| r.path == facet.path >> facet.level()).unwrap();
                     for step in (0..facet.level()).rev() {
                         needed.insert(at.middle());
