@@ -37,7 +37,7 @@ const SERVER: &[(&str, &[&str])] = &[
     ("sample", &[]),
     ("demo", &["hierarchy", "http", "ingest", "progress", "sample"]),
     ("zone", &["height", "inspect", "progress", "projection", "store"]),
-    ("experiment", &["canvas", "ingest", "measure", "progress", "simplify"]),
+    ("experiment", &["canvas", "hierarchy", "http", "ingest", "measure", "progress", "simplify"]),
 ];
 
 /// `cut` is a pure function of what it is given; the GPU is `render`'s and the fronts'.

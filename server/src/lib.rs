@@ -4,6 +4,7 @@ pub mod canvas;
 pub mod chunks;
 pub mod curve;
 pub mod demo;
+pub mod experiment;
 pub mod height;
 pub mod hierarchy;
 pub mod http;

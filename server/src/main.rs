@@ -3,6 +3,7 @@
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use diamantina_protocol::message::{Kind, is_name};
 use diamantina_protocol::points::Rule;
+use diamantina_server::experiment::ExperimentError;
 use diamantina_server::hierarchy::{self, BuildError, Estimate, Report};
 use diamantina_server::ingest::IngestError;
 use diamantina_server::inspect::{self, Inspection};
@@ -10,7 +11,7 @@ use diamantina_server::progress::Progress;
 use diamantina_server::store::{Store, StoreError};
 use diamantina_server::zone::polygon::Coordinates;
 use diamantina_server::zone::{self, ZoneError};
-use diamantina_server::{curve, demo, http, ingest};
+use diamantina_server::{curve, demo, experiment, http, ingest};
 use std::io::{IsTerminal, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -39,6 +40,8 @@ enum Command {
     Zone(Box<ZoneArgs>),
     /// Build a sample scene, serve it and render a picture of it
     Demo(DemoArgs),
+    /// Compare ways to select and transmit points: tables, plots and a report
+    Experiment(Box<ExperimentArgs>),
     /// Ask a running server whether it is well (for container health checks)
     Health(HealthArgs),
 }
@@ -200,6 +203,26 @@ struct DemoArgs {
 }
 
 #[derive(Args)]
+struct ExperimentArgs {
+    /// Which
+    #[arg(value_name = "NAME", value_parser = experiment::ALL.iter().map(|e| e.name).collect::<Vec<_>>())]
+    name: String,
+    /// DEM files, each by itself, in any format that `build` reads
+    #[arg(required = true, value_name = "DEM")]
+    sources: Vec<PathBuf>,
+    /// The folder for the tables (CSV), the pictures and report.html
+    #[arg(short, long, value_name = "FOLDER")]
+    output: PathBuf,
+    #[command(flatten)]
+    options: experiment::Options,
+    #[command(flatten)]
+    ingest: ingest::Options,
+    /// Print the tables as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Args)]
 struct HealthArgs {
     /// The server's address
     #[arg(default_value = "127.0.0.1:8080", value_name = "ADDRESS:PORT")]
@@ -260,6 +283,7 @@ fn main() -> ExitCode {
         Command::Inspect(args) => inspect_store(&args),
         Command::Zone(args) => compute_zone(*args),
         Command::Demo(args) => demonstrate(&args),
+        Command::Experiment(args) => experiment(&args),
         Command::Health(args) => http::ask_health(args.address).map_err(|e| Failure(1, e)),
     };
     match result {
@@ -634,4 +658,42 @@ fn print_zone(out: &mut impl Write, store: &Path, r: &zone::Report) -> std::io::
 fn demonstrate(args: &DemoArgs) -> Result<(), Failure> {
     let headless = args.headless || std::env::var("HEADLESS").is_ok_and(|v| !v.is_empty() && v != "0");
     demo::run(&args.folder, args.samples, args.listen, headless).map_err(|e| Failure(1, e.to_string()))
+}
+
+fn experiment(args: &ExperimentArgs) -> Result<(), Failure> {
+    let progress = Arc::new(Progress::new());
+    stop_on_signals(&progress)?;
+    let found = experiment::run(&args.name, &args.sources, &args.ingest, &args.options, &progress);
+    progress.finish();
+    let report = found.map_err(|e| {
+        let code = match e {
+            ExperimentError::Unknown { .. } | ExperimentError::Options { .. } => 2,
+            ExperimentError::Ingest(IngestError::Options { .. }) => 2,
+            ExperimentError::Stopped => INTERRUPTED,
+            _ => 1,
+        };
+        Failure(code, e.to_string())
+    })?;
+    report.write(&args.output)?;
+    let mut out = std::io::stdout().lock();
+    if args.json {
+        return Ok(shown(writeln!(out, "{}", serde_json::to_string_pretty(&report)?))?);
+    }
+    Ok(shown(print_experiment(&mut out, &args.output, &report))?)
+}
+
+fn print_experiment(
+    out: &mut impl Write,
+    folder: &Path,
+    report: &experiment::report::Report,
+) -> std::io::Result<()> {
+    writeln!(out, "{}", report.title)?;
+    for note in &report.notes {
+        writeln!(out, "  {note}")?;
+    }
+    for table in &report.tables {
+        let file = folder.join(format!("{}.csv", table.name));
+        writeln!(out, "  {}: {} rows in {}", table.caption, table.rows.len(), file.display())?;
+    }
+    writeln!(out, "Next: open {}", folder.join("report.html").display())
 }

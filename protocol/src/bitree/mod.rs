@@ -1,0 +1,533 @@
+//! A set of points on a square grid, and the one triangulation that it implies.
+//!
+//! A bitree keeps the heights of *real* points only. A real point is the middle of the hypotenuse of one or
+//! two triangles of the bintree, and those must be there to be split at it; so must the triangles that
+//! they come from, whose own middles are then present as *fictitious* points, with the mean height of the
+//! two ends. Nothing else is split: a fictitious point splits the triangle that needs it and not the one
+//! across, and since it lies exactly on the other's hypotenuse there is no gap between them. Levels of
+//! neighbours may differ by any number.
+//!
+//! The trick: a triangle is split if and only if it or some triangle below it has a real middle. So
+//! the whole structure is one count a triangle, of such triangles at or below it. Adding a point
+//! adds 1 along the paths to its one or two triangles, removing it takes that away again: the way back is
+//! exact, whatever else was added in between. A whole selection at once is counted from the finest
+//! triangles up, in one pass.
+//!
+//! This is the unrestricted hierarchical triangulation of the bitree paper (dependencies of real and
+//! fictitious points, its section 2.2). Heights are `f64`: a mean halves, so sums of 24-bit heights over
+//! the 48 levels at most stay exact, and the same everywhere.
+//!
+//! [`Bitree::triangles`] lists triangles, [`Bitree::triangles_closed`] also those that close T-junctions;
+//! [`strip`] has the references of a triangle strip.
+
+pub mod strip;
+
+mod mesh;
+
+pub use mesh::Corner;
+
+use crate::bintree::{Forest, Point};
+use std::ops::ControlFlow;
+
+/// The largest grid: 2^12 + 1 points a side; 134 MB of counts and as much of heights.
+pub const LOG2_MAX: u8 = 12;
+
+/// What a grid point is in a bitree.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Presence {
+    /// No triangle has it as a corner.
+    Absent,
+    /// Needed by some triangle; its height is deduced.
+    Fictitious,
+    /// Selected; its height is its own.
+    Real,
+}
+
+/// Points selected from a grid of (2^k + 1)^2, with the triangulation that they imply. Takes 16 bytes a
+/// point of the grid, selected or not.
+#[derive(Debug, Clone)]
+pub struct Bitree {
+    log2: u8,
+    /// Height of each real point, row by row, NaN for the others; the corners are always real.
+    real: Vec<f64>,
+    /// By path: triangles at or below with a real middle.
+    below: Vec<u32>,
+}
+
+/// A triangle of the hierarchy with the heights that the bitree's surface has at its corners, whether it
+/// is drawn, split or part of a larger one.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Facet {
+    path: u32,
+    corners: [Point; 3],
+    heights: [f64; 3],
+}
+
+impl Facet {
+    /// Its corners, turning left, apex in the middle.
+    #[must_use]
+    pub fn corners(&self) -> [Point; 3] {
+        self.corners
+    }
+
+    /// The heights of its corners, in the same order.
+    #[must_use]
+    pub fn heights(&self) -> [f64; 3] {
+        self.heights
+    }
+
+    /// The number of splits from the half of the grid to here.
+    #[must_use]
+    pub fn level(&self) -> u32 {
+        self.path.ilog2() - 1
+    }
+
+    /// A number that tells it from all others of its grid: from 2, below 4 * 4^k.
+    #[must_use]
+    pub fn path(&self) -> u32 {
+        self.path
+    }
+
+    /// The middle of the hypotenuse; of the finest triangles, which have none on the grid, their corner.
+    #[must_use]
+    pub fn middle(&self) -> Point {
+        middle(self.corners)
+    }
+}
+
+impl Bitree {
+    /// The two root triangles of a grid of 2^`log2` cells a side; `corners` are the heights at south-west,
+    /// south-east, north-east and north-west. `None` unless `log2` is 1 to [`LOG2_MAX`] and the heights are
+    /// numbers.
+    #[must_use]
+    pub fn new(log2: u8, corners: [f64; 4]) -> Option<Self> {
+        if !(1..=LOG2_MAX).contains(&log2) || corners.iter().any(|h| h.is_nan()) {
+            return None;
+        }
+        let side = 1u32 << log2;
+        let points = (side as usize + 1).pow(2);
+        let mut bitree = Self { log2, real: vec![f64::NAN; points], below: vec![0; 2 << (2 * log2)] };
+        for (point, height) in bitree.outermost().into_iter().zip(corners) {
+            let slot = bitree.slot(point);
+            bitree.real[slot] = height;
+        }
+        Some(bitree)
+    }
+
+    /// A whole selection at once: the heights of all points of the grid, rows from the south, NaN where a
+    /// point is not selected. The same as adding them one by one, in time proportional to the grid. `None`
+    /// unless `log2` is 1 to [`LOG2_MAX`], there are (2^`log2` + 1)^2 heights and the corners are selected.
+    #[must_use]
+    pub fn of(log2: u8, heights: Vec<f64>) -> Option<Self> {
+        let points = ((1usize << log2.min(LOG2_MAX)) + 1).pow(2);
+        if !(1..=LOG2_MAX).contains(&log2) || heights.len() != points {
+            return None;
+        }
+        let mut bitree = Self { log2, real: heights, below: vec![0; 2 << (2 * log2)] };
+        if bitree.outermost().iter().any(|p| bitree.real[bitree.slot(*p)].is_nan()) {
+            return None;
+        }
+        for root in bitree.roots() {
+            bitree.recount(root.path, root.corners);
+        }
+        Some(bitree)
+    }
+
+    /// Counts the real middles at and below a triangle.
+    fn recount(&mut self, path: u32, corners: [Point; 3]) -> u32 {
+        if path as usize >= self.below.len() {
+            return 0;
+        }
+        let m = middle(corners);
+        let mut count = u32::from(!self.real[self.slot(m)].is_nan());
+        for (child, corners) in split(path, corners, m) {
+            count += self.recount(child, corners);
+        }
+        self.below[path as usize] = count;
+        count
+    }
+
+    /// Base-2 logarithm of the cells along a side.
+    #[must_use]
+    pub fn log2(&self) -> u8 {
+        self.log2
+    }
+
+    /// Cells along a side.
+    #[must_use]
+    pub fn side(&self) -> u32 {
+        1 << self.log2
+    }
+
+    /// South-west, south-east, north-east, north-west.
+    fn outermost(&self) -> [Point; 4] {
+        let side = self.side();
+        [[0, 0], [side, 0], [side, side], [0, side]]
+    }
+
+    fn slot(&self, [x, y]: Point) -> usize {
+        y as usize * (self.side() as usize + 1) + x as usize
+    }
+
+    fn inside(&self, [x, y]: Point) -> bool {
+        x <= self.side() && y <= self.side()
+    }
+
+    /// The level of a point: 0 for the corners, else one more than that of the triangles it is the middle
+    /// of. `None` outside of the grid.
+    #[must_use]
+    pub fn level(&self, point: Point) -> Option<u32> {
+        self.inside(point).then(|| level(self.log2, point))
+    }
+
+    /// Selects a point. Gives back the height it had, if it was real already. A point outside of the grid
+    /// and a height that is no number change nothing.
+    pub fn add(&mut self, point: Point, height: f64) -> Option<f64> {
+        if !self.inside(point) || height.is_nan() {
+            return None;
+        }
+        let slot = self.slot(point);
+        let before = std::mem::replace(&mut self.real[slot], height);
+        if before.is_nan() {
+            self.count(point, 1);
+            return None;
+        }
+        Some(before)
+    }
+
+    /// Takes a point out of the selection; gives back its height. The corners stay.
+    pub fn remove(&mut self, point: Point) -> Option<f64> {
+        let height = self.real(point).filter(|_| self.level(point) != Some(0))?;
+        let slot = self.slot(point);
+        self.real[slot] = f64::NAN;
+        self.count(point, u32::MAX);
+        Some(height)
+    }
+
+    /// Adds `change` (modulo 2^32) along the paths to the triangles that have the point as their middle.
+    fn count(&mut self, point: Point, change: u32) {
+        for facet in self.around(point).into_iter().flatten() {
+            let mut path = facet.path;
+            while path > 1 {
+                let count = &mut self.below[path as usize];
+                *count = count.wrapping_add(change);
+                path >>= 1;
+            }
+        }
+    }
+
+    /// The one or two triangles that have the point as their middle, whether they are drawn or not; none for
+    /// the corners and outside of the grid. Costs one step a level.
+    #[must_use]
+    pub fn around(&self, point: Point) -> [Option<Facet>; 2] {
+        let Some(level) = self.level(point).filter(|l| *l > 0) else { return [None; 2] };
+        // A step from the point that leads into one of them, and its opposite into the other. Beside the
+        // centre of a square the triangles lie to the left and right whichever diagonal it has.
+        let [x, y] = point;
+        let zeros = (x | y).trailing_zeros();
+        let [dx, dy] = if (x >> zeros) & 1 == 1 && (y >> zeros) & 1 == 0 { [0, 1] } else { [1, 0] };
+        [1, -1].map(|sign| {
+            let probe = [4 * i64::from(x) + sign * dx, 4 * i64::from(y) + sign * dy];
+            self.descend(probe, level - 1)
+        })
+    }
+
+    /// The triangle of a level that has a place, in quarters of cells, strictly inside.
+    fn descend(&self, place: [i64; 2], level: u32) -> Option<Facet> {
+        let end = 4 * i64::from(self.side());
+        if place.iter().any(|v| !(0..=end).contains(v)) {
+            return None;
+        }
+        let [lower, upper] = self.roots();
+        let mut at = if place[0] > place[1] { lower } else { upper };
+        for _ in 0..level {
+            let (m, c) = (at.middle().map(i64::from), at.corners[1].map(i64::from));
+            let (along, to) = ([m[0] - c[0], m[1] - c[1]], [place[0] - 4 * c[0], place[1] - 4 * c[1]]);
+            let [left, right] = self.halves(&at);
+            at = if along[0] * to[1] > along[1] * to[0] { left } else { right };
+        }
+        Some(at)
+    }
+
+    /// The two halves of the grid.
+    #[must_use]
+    pub fn roots(&self) -> [Facet; 2] {
+        let forest = Forest::single(self.log2);
+        let mut roots = forest.root_triangles().map(|t| {
+            let corners = forest.corners(t).unwrap_or_default();
+            let heights = corners.map(|p| self.real[self.slot(p)]);
+            Facet { path: u32::try_from(t.path()).unwrap_or(u32::MAX), corners, heights }
+        });
+        // A single square has exactly two.
+        let nothing = Facet { path: 2, corners: [[0; 2]; 3], heights: [0.0; 3] };
+        [roots.next().unwrap_or(nothing), roots.next().unwrap_or(nothing)]
+    }
+
+    /// The triangle of a path, see [`Facet::path`]; `None` out of its range. Costs one step a level.
+    #[must_use]
+    pub fn facet(&self, path: u32) -> Option<Facet> {
+        if path < 2 || path as usize >= 2 * self.below.len() {
+            return None;
+        }
+        let level = path.ilog2() - 1;
+        let mut facet = self.roots()[(path >> level & 1) as usize];
+        for step in (0..level).rev() {
+            facet = self.halves(&facet)[(path >> step & 1) as usize];
+        }
+        Some(facet)
+    }
+
+    /// What a triangle splits into, left then right, whether it is split or not. Not for the finest ones,
+    /// of level 2 k, which have no middle on the grid.
+    #[must_use]
+    pub fn halves(&self, facet: &Facet) -> [Facet; 2] {
+        let ([a, c, b], [ha, hc, hb]) = (facet.corners, facet.heights);
+        let m = facet.middle();
+        let own = self.real[self.slot(m)];
+        let hm = if own.is_nan() { (ha + hb) / 2.0 } else { own };
+        let heights = [[hc, hm, ha], [hb, hm, hc]];
+        let paths = [facet.path << 1, facet.path << 1 | 1];
+        [
+            Facet { path: paths[0], corners: [c, m, a], heights: heights[0] },
+            Facet { path: paths[1], corners: [b, m, c], heights: heights[1] },
+        ]
+    }
+
+    /// Whether there is a real point at its middle or strictly below.
+    #[must_use]
+    pub fn is_split(&self, facet: &Facet) -> bool {
+        self.below.get(facet.path as usize).is_some_and(|count| *count > 0)
+    }
+
+    /// The triangles that are drawn, of those at or below one: calls `visit` with each, until it breaks.
+    /// Costs one step a triangle.
+    pub fn leaves(&self, from: &Facet, visit: &mut impl FnMut(&Facet) -> ControlFlow<()>) -> ControlFlow<()> {
+        if !self.is_split(from) {
+            return visit(from);
+        }
+        for half in self.halves(from) {
+            self.leaves(&half, visit)?;
+        }
+        ControlFlow::Continue(())
+    }
+
+    /// The height of a real point.
+    #[must_use]
+    pub fn real(&self, point: Point) -> Option<f64> {
+        let height = *self.real.get(self.slot(point)).filter(|_| self.inside(point))?;
+        (!height.is_nan()).then_some(height)
+    }
+
+    /// What a point is. Costs one step a level.
+    #[must_use]
+    pub fn presence(&self, point: Point) -> Presence {
+        if self.real(point).is_some() {
+            Presence::Real
+        } else if self.around(point).into_iter().flatten().any(|t| self.is_split(&t)) {
+            Presence::Fictitious
+        } else {
+            Presence::Absent
+        }
+    }
+
+    /// The height of a point that is present: its own, or the mean of the ends of its hypotenuse.
+    #[must_use]
+    pub fn height(&self, point: Point) -> Option<f64> {
+        match self.presence(point) {
+            Presence::Absent => None,
+            Presence::Real => self.real(point),
+            Presence::Fictitious => {
+                let [ha, _, hb] = self.around(point).into_iter().flatten().next()?.heights;
+                Some((ha + hb) / 2.0)
+            }
+        }
+    }
+}
+
+/// What was selected is the same; counts follow from it.
+impl PartialEq for Bitree {
+    fn eq(&self, other: &Self) -> bool {
+        let bits = |tree: &Self| tree.real.iter().map(|h| h.to_bits()).collect::<Vec<_>>();
+        self.log2 == other.log2 && bits(self) == bits(other) && self.below == other.below
+    }
+}
+
+/// The level of a point of a grid of 2^`log2` cells a side: see [`Bitree::level`].
+#[must_use]
+pub fn level(log2: u8, [x, y]: Point) -> u32 {
+    let zeros = (x | y).trailing_zeros().min(u32::from(log2));
+    let up = u32::from(log2) - zeros;
+    // On the lattice of squares of 2^zeros cells: centres of larger squares, or middles of their sides.
+    let both_odd = (x >> zeros) & (y >> zeros) & 1 == 1;
+    if up == 0 { 0 } else { 2 * up - u32::from(both_odd) }
+}
+
+/// Path and corners of both halves, left then right.
+fn split(path: u32, [a, c, b]: [Point; 3], m: Point) -> [(u32, [Point; 3]); 2] {
+    [(path << 1, [c, m, a]), (path << 1 | 1, [b, m, c])]
+}
+
+fn middle([a, _, b]: [Point; 3]) -> Point {
+    [a[0].midpoint(b[0]), a[1].midpoint(b[1])]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn flat(log2: u8) -> Bitree {
+        Bitree::new(log2, [0.0; 4]).unwrap()
+    }
+
+    #[test]
+    fn levels_follow_from_coordinates() {
+        let bitree = flat(2);
+        let rows: Vec<Vec<u32>> =
+            (0..=4).map(|y| (0..=4).map(|x| bitree.level([x, y]).unwrap()).collect()).collect();
+        assert_eq!(
+            rows,
+            [[0, 4, 2, 4, 0], [4, 3, 4, 3, 4], [2, 4, 1, 4, 2], [4, 3, 4, 3, 4], [0, 4, 2, 4, 0]]
+        );
+        assert_eq!(bitree.level([5, 0]), None);
+    }
+
+    #[test]
+    fn a_real_point_needs_its_apexes_and_a_fictitious_one_only_the_side_that_needs_it() {
+        // The middle of a level-3 hypotenuse: its two apexes, of level 2 and 1, and what those need.
+        let mut bitree = flat(3);
+        bitree.add([1, 2], 7.0);
+        // Its apexes.
+        assert_eq!(bitree.presence([0, 2]), Presence::Fictitious);
+        assert_eq!(bitree.presence([2, 2]), Presence::Fictitious);
+        // What those need on this side, and on no other.
+        assert_eq!(bitree.presence([4, 4]), Presence::Fictitious);
+        assert_eq!(bitree.presence([0, 4]), Presence::Fictitious);
+        assert_eq!(bitree.presence([4, 0]), Presence::Absent, "a restricted quadtree would need it");
+        assert_eq!(bitree.presence([1, 2]), Presence::Real);
+    }
+
+    #[test]
+    fn a_full_grid_has_two_triangles_a_cell() {
+        let mut bitree = flat(3);
+        for y in 0..=8 {
+            for x in 0..=8 {
+                bitree.add([x, y], f64::from(x * y));
+            }
+        }
+        assert_eq!(bitree.triangles().len(), 128);
+        assert_eq!(bitree.points(), (81, 0));
+    }
+
+    /// Some points of a grid, with heights.
+    fn some_points(log2: u8) -> impl Strategy<Value = Vec<(Point, i32)>> {
+        let side = 1u32 << log2;
+        prop::collection::vec((0..=side, 0..=side, -1000i32..1000).prop_map(|(x, y, h)| ([x, y], h)), 0..40)
+    }
+
+    proptest! {
+        #[test]
+        fn triangles_cover_the_grid_once_and_leave_no_gap(points in some_points(5)) {
+            let mut bitree = flat(5);
+            for (p, h) in points { bitree.add(p, f64::from(h)); }
+            let triangles = bitree.triangles();
+            let area: i64 = triangles.iter().map(|t| {
+                let [a, c, b] = t.map(|(p, _)| p.map(i64::from));
+                (c[0] - a[0]) * (b[1] - a[1]) - (c[1] - a[1]) * (b[0] - a[0])
+            }).sum();
+            prop_assert_eq!(area, 2 * 32 * 32);
+            // Every corner that lies on another triangle's side lies at the height of that side.
+            let corners: std::collections::BTreeMap<Point, u64> = triangles.iter().flatten().map(|(p, h)| (*p, h.to_bits())).collect();
+            for t in &triangles {
+                for (p, h) in t { prop_assert_eq!(bitree.height(*p), Some(*h)); }
+                for i in 0..3 {
+                    let ((a, ha), (b, hb)) = (t[i], t[(i + 1) % 3]);
+                    let steps = a[0].abs_diff(b[0]).max(a[1].abs_diff(b[1]));
+                    for s in 1..steps {
+                        // One step along each axis that the side runs along, forwards or backwards.
+                        let along = |from: u32, to: u32| match from.cmp(&to) {
+                            std::cmp::Ordering::Less => from + s,
+                            std::cmp::Ordering::Equal => from,
+                            std::cmp::Ordering::Greater => from - s,
+                        };
+                        let p = [along(a[0], b[0]), along(a[1], b[1])];
+                        if let Some(h) = corners.get(&p) {
+                            let side = ha + (hb - ha) * f64::from(s) / f64::from(steps);
+                            prop_assert_eq!(f64::from_bits(*h), side, "{:?} on {:?} {:?}", p, a, b);
+                        }
+                    }
+                }
+            }
+        }
+
+        #[test]
+        fn removing_what_was_added_gives_back_the_same(first in some_points(4), second in some_points(4)) {
+            let mut bitree = flat(4);
+            for (p, h) in &first { bitree.add(*p, f64::from(*h)); }
+            let before = bitree.clone();
+            let mut undo = Vec::new();
+            for (p, h) in &second { undo.push((*p, bitree.add(*p, f64::from(*h)))); }
+            for (p, old) in undo.into_iter().rev() {
+                match old {
+                    Some(h) => { bitree.add(p, h); }
+                    None => { bitree.remove(p); }
+                }
+            }
+            prop_assert!(bitree == before);
+        }
+
+        #[test]
+        fn a_selection_at_once_is_the_same_as_point_by_point(points in some_points(4)) {
+            let mut bitree = flat(4);
+            let mut heights = vec![f64::NAN; 17 * 17];
+            for p in bitree.outermost() { heights[bitree.slot(p)] = 0.0; }
+            for (p, h) in &points {
+                bitree.add(*p, f64::from(*h));
+                heights[bitree.slot(*p)] = f64::from(*h);
+            }
+            let at_once = Bitree::of(4, heights).unwrap();
+            prop_assert_eq!(at_once.triangles(), bitree.triangles());
+            prop_assert!(at_once == bitree);
+        }
+
+        #[test]
+        fn what_is_present_is_what_the_dependencies_say(points in some_points(4)) {
+            let mut bitree = flat(4);
+            for (p, h) in &points { bitree.add(*p, f64::from(*h)); }
+            // The paper's rules, followed one by one: a real point needs all its apexes; a fictitious one
+            // the apex of the triangle whose child needs it.
+            let mut needed = std::collections::BTreeSet::new();
+            for (p, _) in &points {
+                for facet in bitree.around(*p).into_iter().flatten() {
+                    needed.insert(*p);
+                    // Its apex is the middle of the triangle that it came from, and so on up.
+                    prop_assert_eq!(bitree.facet(facet.path), Some(facet));
+                    let mut at = bitree.roots().into_iter().find(|r| r.path == facet.path >> facet.level()).unwrap();
+                    for step in (0..facet.level()).rev() {
+                        needed.insert(at.middle());
+                        at = bitree.halves(&at)[(facet.path >> step & 1) as usize];
+                    }
+                }
+            }
+            for y in 0..=16 { for x in 0..=16 {
+                let present = bitree.presence([x, y]) != Presence::Absent;
+                let corner = bitree.level([x, y]) == Some(0);
+                prop_assert_eq!(present, corner || needed.contains(&[x, y]), "{} {}", x, y);
+            }}
+        }
+    }
+
+    #[test]
+    fn impossible_grids_are_refused() {
+        assert!(Bitree::new(0, [0.0; 4]).is_none());
+        assert!(Bitree::new(LOG2_MAX + 1, [0.0; 4]).is_none());
+        assert!(Bitree::new(1, [0.0, 0.0, f64::NAN, 0.0]).is_none(), "a corner without a height");
+        assert!(Bitree::of(1, vec![0.0; 8]).is_none(), "a point too few");
+        assert!(Bitree::of(1, [vec![0.0; 8], vec![f64::NAN]].concat()).is_none());
+        let mut bitree = flat(1);
+        assert_eq!(bitree.add([3, 0], 1.0), None);
+        assert_eq!(bitree.add([1, 1], f64::NAN), None);
+        assert_eq!(bitree, flat(1));
+        assert_eq!(bitree.remove([0, 0]), None, "corners stay");
+    }
+}

@@ -1,0 +1,187 @@
+//! Experiments in progressive transmission: selections, baselines, and the tables of the papers.
+//!
+//! Each experiment is one file with a function from [`Run`] or [`Whole`] to [`Report`], and a line in [`ALL`]. What sender and
+//! receiver share, the bitree and its strips, is in the protocol; here is what chooses points and what
+//! they are compared with.
+//!
+//! ```text
+//! DEM -> windows -> fields -> select | quadtree | curvature -> measured anew -> report: CSV, SVG, PNG, HTML, JSON
+//! ```
+
+pub mod curvature;
+pub mod field;
+pub mod lod;
+pub mod plot;
+pub mod quadtree;
+pub mod report;
+pub mod scan;
+pub mod select;
+pub mod windows;
+
+mod strips;
+mod tolerances;
+
+use crate::ingest::IngestError;
+use crate::progress::Progress;
+use report::Report;
+use select::Criterion;
+use std::path::PathBuf;
+
+/// What an experiment is told.
+#[derive(Debug, Clone, clap::Args)]
+#[group(id = "experiment_options")]
+pub struct Options {
+    #[command(flatten)]
+    pub(crate) windows: windows::Options,
+    /// Tolerances, percent of each window's relief
+    #[arg(long, value_delimiter = ',', default_values_t = [0.0, 1.0, 2.0, 7.0, 10.0, 14.0, 50.0], value_name = "PERCENT")]
+    pub(crate) tolerances: Vec<f64>,
+    /// How the error of a triangle is told
+    #[arg(long, value_enum, default_value_t = Criterion::Vertical)]
+    pub(crate) criterion: Criterion,
+    /// Weights of samples: a raster of numbers from 0 to 1 on the DEM's own grid; no data counts as 0
+    #[arg(long, value_name = "RASTER")]
+    pub(crate) mask: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) flights: lod::Options,
+}
+
+/// One run of an experiment.
+#[derive(Debug)]
+pub struct Run<'a> {
+    /// The fields to work on.
+    pub(crate) windows: &'a [windows::Window],
+    pub(crate) options: &'a Options,
+    pub(crate) progress: &'a Progress,
+}
+
+/// One run of an experiment on whole DEMs.
+#[derive(Debug)]
+pub struct Whole<'a> {
+    /// The files, each by itself.
+    pub(crate) sources: &'a [PathBuf],
+    pub(crate) ingest: &'a crate::ingest::Options,
+    pub(crate) options: &'a Options,
+    pub(crate) progress: &'a Progress,
+}
+
+/// What an experiment works on.
+#[derive(Debug, Clone, Copy)]
+enum Work {
+    /// Square windows of the DEMs.
+    Windows(fn(&Run<'_>) -> Result<Report, ExperimentError>),
+    /// The DEMs as they are.
+    Whole(fn(&Whole<'_>) -> Result<Report, ExperimentError>),
+}
+
+/// An experiment by its name.
+#[derive(Debug, Clone, Copy)]
+pub struct Experiment {
+    /// What the command line calls it.
+    pub name: &'static str,
+    /// What it shows.
+    pub about: &'static str,
+    work: Work,
+}
+
+/// All there are.
+pub const ALL: &[Experiment] = &[
+    Experiment {
+        name: "tolerances",
+        about: "points, triangles and strips of bitree and restricted quadtree within tolerances",
+        work: Work::Windows(tolerances::run),
+    },
+    Experiment {
+        name: "strips",
+        about: "references of triangle strips beside separate triangles and other orders",
+        work: Work::Windows(strips::run),
+    },
+    Experiment {
+        name: "lod",
+        about: "bytes and triangles of flights with each term of the client's level of detail on and off",
+        work: Work::Whole(lod::run),
+    },
+];
+
+/// Why an experiment has no result.
+#[derive(Debug, thiserror::Error)]
+pub enum ExperimentError {
+    /// The name is of none.
+    #[error("experiment '{found}': expected one of {}", names())]
+    Unknown {
+        /// What was asked for.
+        found: String,
+    },
+    /// The DEM or the mask cannot be read.
+    #[error(transparent)]
+    Ingest(#[from] IngestError),
+    /// An option makes no sense, or not for this DEM.
+    #[error("{option}: expected {expected}, found {found}")]
+    Options {
+        /// Which.
+        option: &'static str,
+        /// What would do.
+        expected: String,
+        /// What was given.
+        found: String,
+    },
+    /// A result cannot be written.
+    #[error("{}: cannot write: {source}; name another folder with -o", path.display())]
+    Write {
+        /// Where.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// A plot cannot be drawn.
+    #[error("plot: {0}")]
+    Plot(String),
+    /// The flights did not come to an end.
+    #[error(transparent)]
+    Lod(#[from] lod::LodError),
+    /// It was asked to stop.
+    #[error("stopped; nothing was written")]
+    Stopped,
+}
+
+fn names() -> String {
+    ALL.iter().map(|e| e.name).collect::<Vec<_>>().join(", ")
+}
+
+/// Runs the experiment of a name on DEM files.
+///
+/// # Errors
+/// When there is no such experiment, a file cannot be read, or an option does not fit.
+pub fn run(
+    name: &str,
+    sources: &[PathBuf],
+    ingest: &crate::ingest::Options,
+    options: &Options,
+    progress: &Progress,
+) -> Result<Report, ExperimentError> {
+    let unknown = || ExperimentError::Unknown { found: name.to_owned() };
+    let experiment = ALL.iter().find(|e| e.name == name).ok_or_else(unknown)?;
+    if let Some(bad) = options.tolerances.iter().find(|t| !(0.0..=1e6).contains(*t)) {
+        return Err(ExperimentError::Options {
+            option: "--tolerances",
+            expected: "percentages from 0".to_owned(),
+            found: bad.to_string(),
+        });
+    }
+    match experiment.work {
+        Work::Windows(run) => {
+            let windows =
+                windows::read(sources, ingest, &options.windows, options.mask.as_deref(), progress)?;
+            run(&Run { windows: &windows, options, progress })
+        }
+        Work::Whole(run) => run(&Whole { sources, ingest, options, progress }),
+    }
+}
+
+/// The mean of some numbers and their sample standard deviation, 0 for fewer than two.
+fn mean_and_spread(values: &[f64]) -> [f64; 2] {
+    let n = values.len().max(1) as f64;
+    let mean = values.iter().sum::<f64>() / n;
+    let squares: f64 = values.iter().map(|v| (v - mean) * (v - mean)).sum();
+    [mean, if values.len() < 2 { 0.0 } else { (squares / (n - 1.0)).sqrt() }]
+}

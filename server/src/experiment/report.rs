@@ -1,0 +1,157 @@
+//! What an experiment hands in: tables and pictures, written as CSV, SVG or PNG, one HTML page and JSON.
+
+use super::ExperimentError;
+use serde::Serialize;
+use std::fmt::Write as _;
+use std::path::Path;
+
+/// A table; all rows as wide as the columns.
+#[derive(Debug, Serialize)]
+pub struct Table {
+    /// Name of its file, without `.csv`.
+    pub name: String,
+    /// What it shows, a sentence.
+    pub caption: String,
+    /// Headings with units.
+    pub columns: Vec<String>,
+    /// Cells as they are written.
+    pub rows: Vec<Vec<String>>,
+}
+
+impl Table {
+    /// An empty table.
+    #[must_use]
+    pub fn new(name: &str, caption: &str, columns: &[&str]) -> Self {
+        let columns = columns.iter().map(|c| (*c).to_owned()).collect();
+        Self { name: name.to_owned(), caption: caption.to_owned(), columns, rows: Vec::new() }
+    }
+
+    /// Adds a row.
+    pub fn push(&mut self, cells: impl IntoIterator<Item = String>) {
+        self.rows.push(cells.into_iter().collect());
+    }
+
+    /// Comma-separated, quoted where needed, a heading first (RFC 4180 with bare line feeds).
+    #[must_use]
+    pub fn csv(&self) -> String {
+        let line = |cells: &[String]| {
+            let quoted = cells.iter().map(|c| match c.contains([',', '"', '\n']) {
+                true => format!("\"{}\"", c.replace('"', "\"\"")),
+                false => c.clone(),
+            });
+            quoted.collect::<Vec<_>>().join(",") + "\n"
+        };
+        line(&self.columns) + &self.rows.iter().map(|row| line(row)).collect::<String>()
+    }
+}
+
+/// A picture as its file.
+#[derive(Debug, Serialize)]
+pub struct Picture {
+    /// Name of its file, with the ending.
+    pub file: String,
+    /// What it shows, a sentence.
+    pub caption: String,
+    /// The file.
+    #[serde(skip)]
+    pub bytes: Vec<u8>,
+}
+
+/// All that an experiment found.
+#[derive(Debug, Serialize)]
+pub struct Report {
+    /// A heading.
+    pub title: String,
+    /// What was done, with what, in sentences.
+    pub notes: Vec<String>,
+    /// Figures.
+    pub tables: Vec<Table>,
+    /// Plots and views.
+    pub pictures: Vec<Picture>,
+}
+
+impl Report {
+    /// Writes the tables, the pictures and `report.html` into a folder, which is made if need be.
+    ///
+    /// # Errors
+    /// When the folder cannot be written.
+    pub fn write(&self, folder: &Path) -> Result<(), ExperimentError> {
+        let save = |name: &str, bytes: &[u8]| {
+            let path = folder.join(name);
+            std::fs::write(&path, bytes).map_err(|source| ExperimentError::Write { path, source })
+        };
+        std::fs::create_dir_all(folder)
+            .map_err(|source| ExperimentError::Write { path: folder.to_owned(), source })?;
+        for table in &self.tables {
+            save(&format!("{}.csv", table.name), table.csv().as_bytes())?;
+        }
+        for picture in &self.pictures {
+            save(&picture.file, &picture.bytes)?;
+        }
+        save("report.html", self.html().as_bytes())
+    }
+
+    /// One page that needs nothing but the pictures beside it.
+    #[must_use]
+    pub fn html(&self) -> String {
+        let mut page = format!(
+            "<!doctype html><html lang=\"en\"><meta charset=\"utf-8\"><title>{0}</title><style>{STYLE}</style><h1>{0}</h1>\n",
+            escaped(&self.title)
+        );
+        // Writing to a string does not fail.
+        for note in &self.notes {
+            let _ = writeln!(page, "<p>{}</p>", escaped(note));
+        }
+        for picture in &self.pictures {
+            let (file, caption) = (escaped(&picture.file), escaped(&picture.caption));
+            let _ = writeln!(
+                page,
+                "<figure><img src=\"{file}\" alt=\"{caption}\"><figcaption>{caption}</figcaption></figure>"
+            );
+        }
+        for table in &self.tables {
+            let cells = |cells: &[String], tag: &str| {
+                cells.iter().map(|c| format!("<{tag}>{}</{tag}>", escaped(c))).collect::<String>()
+            };
+            let _ = writeln!(
+                page,
+                "<div class=\"table\"><table><caption>{} (<a href=\"{1}.csv\">{1}.csv</a>)</caption><tr>{2}</tr>",
+                escaped(&table.caption),
+                escaped(&table.name),
+                cells(&table.columns, "th")
+            );
+            for row in &table.rows {
+                let _ = writeln!(page, "<tr>{}</tr>", cells(row, "td"));
+            }
+            page.push_str("</table></div>\n");
+        }
+        page
+    }
+}
+
+const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;max-width:72rem;margin:2rem auto;padding:0 1rem;color:#222}\
+table{border-collapse:collapse;font-size:.85rem;font-variant-numeric:tabular-nums}caption{text-align:left;padding:.5rem 0}\
+th,td{border-bottom:1px solid #ddd;padding:.2rem .6rem;text-align:right}th{border-bottom:2px solid #888;vertical-align:bottom}\
+.table{overflow-x:auto;margin:2rem 0}figure{margin:2rem 0}img{max-width:100%}figcaption,caption{color:#555}";
+
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tables_are_quoted_and_pages_escaped() {
+        let mut table = Table::new("t", "a <b>", &["x, y", "z"]);
+        table.push(["1".to_owned(), "say \"so\"".to_owned()]);
+        assert_eq!(table.csv(), "\"x, y\",z\n1,\"say \"\"so\"\"\"\n");
+        let report =
+            Report { title: "a & b".to_owned(), notes: vec![], tables: vec![table], pictures: vec![] };
+        assert!(report.html().contains("a &amp; b") && report.html().contains("a &lt;b&gt;"));
+        let folder = tempfile::tempdir().unwrap();
+        report.write(&folder.path().join("new")).unwrap();
+        assert!(folder.path().join("new/t.csv").exists() && folder.path().join("new/report.html").exists());
+    }
+}

@@ -1,0 +1,163 @@
+//! What is wrong with a triangle, by several measures.
+
+use crate::experiment::curvature::curvatures;
+use crate::experiment::field::Field;
+use crate::experiment::scan::{Plane, rows, vertical_error};
+use diamantina_protocol::bitree::{Bitree, Facet};
+use std::ops::ControlFlow;
+use std::sync::OnceLock;
+
+/// A field, with the weight of each sample and what criteria derive from it once.
+#[derive(Debug)]
+pub struct Ground<'a> {
+    field: &'a Field,
+    weights: Option<&'a [f32]>,
+    curvatures: OnceLock<Vec<f64>>,
+    full: OnceLock<Bitree>,
+}
+
+impl<'a> Ground<'a> {
+    /// A field whose samples all count fully, or by a mask: a weight of 0 to 1 for each, rows from the south.
+    /// `None` if there are not as many weights as samples, or one is out of range.
+    #[must_use]
+    pub fn new(field: &'a Field, weights: Option<&'a [f32]>) -> Option<Self> {
+        let fits = weights
+            .is_none_or(|w| w.len() == field.heights().len() && w.iter().all(|v| (0.0..=1.0).contains(v)));
+        fits.then(|| Self { field, weights, curvatures: OnceLock::new(), full: OnceLock::new() })
+    }
+
+    /// The heights.
+    #[must_use]
+    pub fn field(&self) -> &'a Field {
+        self.field
+    }
+
+    fn weight(&self, slot: usize) -> f64 {
+        self.weights.map_or(1.0, |w| f64::from(w[slot]))
+    }
+}
+
+/// How the error of a triangle is told. Each sample's part is multiplied with its weight; samples without
+/// data have none. Borders count.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, clap::ValueEnum)]
+pub enum Criterion {
+    /// The largest vertical distance to a sample, metres: the guarantee.
+    Vertical,
+    /// The largest distance at right angles to the triangle's plane, metres.
+    Euclidean,
+    /// The sum of the samples' curvatures: see [`crate::experiment::curvature`].
+    Curvature,
+    /// The largest angle between the triangle and the finest triangles that it stands for, degrees.
+    Normal,
+    /// How far a point is off the mean of its hypotenuse's ends, all being samples, metres: of each point
+    /// alone, no bound on anything.
+    Coefficient,
+}
+
+impl Criterion {
+    /// The error of a triangle; the search may end once it is more than `enough`.
+    #[must_use]
+    pub fn error(self, ground: &Ground<'_>, facet: &Facet, enough: f64) -> f64 {
+        let field = ground.field;
+        match self {
+            Self::Vertical => vertical_error(field, ground.weights, facet.corners(), facet.heights(), enough),
+            Self::Euclidean => {
+                let upright = upright(field, facet);
+                // A little more, lest a search end at what rounds down to enough.
+                let enough = enough / upright * (1.0 + 1e-12);
+                upright * vertical_error(field, ground.weights, facet.corners(), facet.heights(), enough)
+            }
+            Self::Curvature => curvature_sum(ground, facet, enough),
+            Self::Normal => normal_error(ground, facet, enough),
+            Self::Coefficient => {
+                let m = facet.middle();
+                let [ha, _, hb] = facet.heights();
+                let off = (field.at(m) - (ha + hb) / 2.0).abs();
+                if off.is_nan() || facet.level() >= 2 * u32::from(field.log2()) { 0.0 } else { off }
+            }
+        }
+    }
+
+    /// Whether the error depends on the triangle's own heights, so that it tells what may be left out.
+    #[must_use]
+    pub fn is_measured(self) -> bool {
+        !matches!(self, Self::Curvature | Self::Coefficient)
+    }
+
+    /// How far a sample counts as off the surface, if errors are distances: upright, which is never less than
+    /// at right angles to whatever triangle will be there in the end.
+    pub(super) fn distance(self, ground: &Ground<'_>, slot: usize, off: f64) -> Option<f64> {
+        matches!(self, Self::Vertical | Self::Euclidean).then(|| ground.weight(slot) * off.abs())
+    }
+
+    /// The points whose coefficients are more than the tolerance; by another criterion, the corners alone.
+    pub(super) fn direct(self, ground: &Ground<'_>, tolerance: f64) -> Bitree {
+        let field = ground.field;
+        let (full, mut tree) = (field.full_tree(), field.tree());
+        for slot in 0..field.heights().len() {
+            let point = field.point(slot);
+            if let Some(facet) = full.around(point).into_iter().flatten().next()
+                && self == Self::Coefficient
+                && ground.weight(slot) * self.error(ground, &facet, f64::INFINITY) > tolerance
+            {
+                tree.add(point, field.at(point));
+            }
+        }
+        tree
+    }
+}
+
+/// The vertical part of the unit normal of a triangle.
+fn upright(field: &Field, facet: &Facet) -> f64 {
+    let [sx, sy] = slopes(field, facet);
+    1.0 / (1.0 + sx * sx + sy * sy).sqrt()
+}
+
+/// Metres of height a metre along x and y.
+fn slopes(field: &Field, facet: &Facet) -> [f64; 2] {
+    let [sx, sy] = Plane::new(facet.corners(), facet.heights()).slope();
+    [sx / field.cell()[0], sy / field.cell()[1]]
+}
+
+fn curvature_sum(ground: &Ground<'_>, facet: &Facet, enough: f64) -> f64 {
+    let field = ground.field;
+    let all = ground.curvatures.get_or_init(|| curvatures(field));
+    let mut sum = 0.0;
+    // The finest triangles have nothing to split.
+    if facet.level() >= 2 * u32::from(field.log2()) {
+        return sum;
+    }
+    rows(facet.corners(), |y, first, last| {
+        let run = field.slot([first, y])..field.slot([last, y]) + 1;
+        sum +=
+            run.clone().zip(&all[run]).map(|(slot, curvature)| ground.weight(slot) * curvature).sum::<f64>();
+        sum <= enough
+    });
+    sum
+}
+
+/// Over the finest triangles that this one stands for; without data at a corner they have no angle.
+fn normal_error(ground: &Ground<'_>, facet: &Facet, enough: f64) -> f64 {
+    let field = ground.field;
+    let full = ground.full.get_or_init(|| field.full_tree());
+    let own = unit_normal(slopes(field, facet));
+    let mut worst = 0.0f64;
+    if let Some(all) = full.facet(facet.path()) {
+        let _ = full.leaves(&all, &mut |finest| {
+            let corners = finest.corners();
+            if corners.iter().all(|p| !field.at(*p).is_nan()) {
+                let other = unit_normal(slopes(field, finest));
+                let cosine: f64 = own.iter().zip(other).map(|(a, b)| a * b).sum();
+                let weight = corners.iter().map(|p| ground.weight(field.slot(*p))).fold(0.0, f64::max);
+                worst = worst.max(weight * cosine.min(1.0).acos().to_degrees());
+            }
+            if worst > enough { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        });
+    }
+    worst
+}
+
+fn unit_normal([sx, sy]: [f64; 2]) -> [f64; 3] {
+    let length = (1.0 + sx * sx + sy * sy).sqrt();
+    [-sx / length, -sy / length, 1.0 / length]
+}

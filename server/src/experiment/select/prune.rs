@@ -1,0 +1,51 @@
+//! Takes out again what a selection does not need.
+//!
+//! Without a point only the one or two triangles at whose middle it stands change, and what is drawn below
+//! them; the triangles above lie on the same surface whether they are split or not. So a point may go if all
+//! drawn triangles below those two stay within the tolerance. The finest go first: there are most of them, and each
+//! that goes may let its triangle vanish.
+
+use super::{Criterion, Ground};
+use diamantina_protocol::bintree::Point;
+use diamantina_protocol::bitree::Bitree;
+use std::ops::ControlFlow;
+
+/// Times that all points are tried: later passes find a handful.
+const PASSES_MAX: usize = 3;
+
+/// Removes points while every triangle stays within `tolerance`. If all were before, all are after.
+pub fn prune(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, tree: &mut Bitree) {
+    let field = ground.field();
+    let levels = 1..=2 * u32::from(field.log2());
+    for _ in 0..PASSES_MAX {
+        let mut by_level = vec![Vec::new(); 2 * usize::from(field.log2()) + 1];
+        for point in (0..field.heights().len()).map(|slot| field.point(slot)) {
+            if let Some(level) =
+                tree.level(point).filter(|l| levels.contains(l) && tree.real(point).is_some())
+            {
+                by_level[level as usize].push(point);
+            }
+        }
+        let mut removed = 0;
+        for point in by_level.into_iter().rev().flatten() {
+            let Some(height) = tree.remove(point) else { continue };
+            if is_good(ground, criterion, tolerance, tree, point) {
+                removed += 1;
+            } else {
+                tree.add(point, height);
+            }
+        }
+        if removed == 0 {
+            return;
+        }
+    }
+}
+
+/// Whether all that is drawn around a point is within the tolerance.
+fn is_good(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, tree: &Bitree, point: Point) -> bool {
+    let within =
+        |found: f64| if found > tolerance { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
+    tree.around(point).into_iter().flatten().all(|facet| {
+        tree.leaves(&facet, &mut |leaf| within(criterion.error(ground, leaf, tolerance))).is_continue()
+    })
+}

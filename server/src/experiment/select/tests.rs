@@ -1,0 +1,157 @@
+//! Every selection keeps what it promises, over all samples.
+
+use super::*;
+use crate::experiment::field::Field;
+use crate::experiment::quadtree;
+use proptest::prelude::{
+    Just, ProptestConfig, any, prop, prop_assert, prop_assert_eq, prop_assume, prop_oneof, proptest,
+};
+use proptest::strategy::Strategy as Generator;
+
+const SIDE: usize = 33;
+
+/// Flat, stepped, spiky, random and partly missing fields.
+fn any_field() -> impl Generator<Value = Field> {
+    let flat = Just(vec![7.0; SIDE * SIDE]);
+    let stepped = (1usize..8, 1usize..8).prop_map(|(i, j)| {
+        (0..SIDE * SIDE).map(|s| (s % SIDE / i * 10 + s / SIDE / j * 3) as f64).collect::<Vec<f64>>()
+    });
+    let spiky = prop::collection::vec((0..SIDE * SIDE, -500i32..500), 1..12).prop_map(|spikes| {
+        let mut heights = vec![0.0; SIDE * SIDE];
+        spikes.into_iter().for_each(|(s, h)| heights[s] = f64::from(h));
+        heights
+    });
+    let random = prop::collection::vec(-100i32..100, SIDE * SIDE)
+        .prop_map(|list| list.into_iter().map(f64::from).collect::<Vec<f64>>());
+    let smooth = (1.0f64..9.0, 1.0f64..9.0).prop_map(|(u, v)| {
+        (0..SIDE * SIDE)
+            .map(|s| 100.0 * ((s % SIDE) as f64 / u).sin() * ((s / SIDE) as f64 / v).cos())
+            .collect::<Vec<f64>>()
+    });
+    let holes = prop::collection::vec((0..SIDE, 0..SIDE, 1..SIDE), 0..4);
+    (prop_oneof![flat, stepped, spiky, random, smooth], holes, any::<bool>()).prop_filter_map(
+        "some data",
+        |(mut heights, holes, has_holes)| {
+            for (x, y, size) in holes.into_iter().filter(|_| has_holes) {
+                for j in y..(y + size).min(SIDE) {
+                    heights[j * SIDE + x..j * SIDE + (x + size).min(SIDE)].fill(f64::NAN);
+                }
+            }
+            Field::new(5, heights, [30.0, 20.0])
+        },
+    )
+}
+
+/// The largest vertical distance, sample by sample, by a walk of its own over each triangle's cells.
+fn plainly(field: &Field, weights: Option<&[f32]>, tree: &Bitree) -> f64 {
+    let mut worst = 0.0f64;
+    for [(a, ha), (c, hc), (b, hb)] in tree.triangles() {
+        let f = |v: u32| f64::from(v);
+        let whole = (f(c[0]) - f(a[0])) * (f(b[1]) - f(a[1])) - (f(b[0]) - f(a[0])) * (f(c[1]) - f(a[1]));
+        for slot in 0..field.heights().len() {
+            let p = field.point(slot);
+            let part = |u: [u32; 2], v: [u32; 2]| {
+                ((f(u[0]) - f(p[0])) * (f(v[1]) - f(p[1])) - (f(v[0]) - f(p[0])) * (f(u[1]) - f(p[1])))
+                    / whole
+            };
+            let [wa, wc, wb] = [part(c, b), part(b, a), part(a, c)];
+            if wa >= 0.0 && wc >= 0.0 && wb >= 0.0 && !field.at(p).is_nan() {
+                let weight = weights.map_or(1.0, |w| f64::from(w[slot]));
+                worst = worst.max(weight * (field.at(p) - (wa * ha + wc * hc + wb * hb)).abs());
+            }
+        }
+    }
+    worst
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+
+    #[test]
+    fn every_strategy_keeps_every_sample_within_the_tolerance(field in any_field(), share in 0.0f64..0.6, masked in any::<bool>()) {
+        let tolerance = if share < 0.1 { 0.0 } else { share * field.relief() };
+        let mask: Vec<f32> = (0..SIDE * SIDE).map(|s| [1.0, 0.5, 0.0][s / SIDE / 5 % 3]).collect();
+        let weights = masked.then_some(&mask[..]);
+        let ground = Ground::new(&field, weights).unwrap();
+        for strategy in [Strategy::Compact, Strategy::Sparse, Strategy::Greedy] {
+            let tree = by_strategy(&ground, Criterion::Vertical, tolerance, strategy);
+            let found = plainly(&field, weights, &tree);
+            prop_assert!(found <= tolerance + 1e-9 * (1.0 + field.relief()), "{} {} {}", strategy, found, tolerance);
+            prop_assert!(largest_error(&ground, Criterion::Vertical, &tree) <= tolerance);
+            let tree = by_strategy(&ground, Criterion::Euclidean, tolerance, strategy);
+            prop_assert!(largest_error(&ground, Criterion::Euclidean, &tree) <= tolerance);
+        }
+        let vertical = |facet: &diamantina_protocol::bitree::Facet, enough: f64| Criterion::Vertical.error(&ground, facet, enough);
+        let quadtree = quadtree::select(&field, tolerance, vertical);
+        prop_assert!(largest_error(&ground, Criterion::Vertical, &quadtree) <= tolerance);
+    }
+
+    #[test]
+    fn without_tolerance_exactly_the_points_off_their_means_are_real(field in any_field()) {
+        // Nothing else can be: a point that is off has to be sent, and one that is not is deduced.
+        prop_assume!(field.samples() == SIDE * SIDE);
+        let ground = Ground::new(&field, None).unwrap();
+        let tree = by_strategy(&ground, Criterion::Vertical, 0.0, Strategy::Compact);
+        prop_assert!(by_strategy(&ground, Criterion::Coefficient, 0.0, Strategy::Direct) == tree);
+        prop_assert!(by_strategy(&ground, Criterion::Vertical, 0.0, Strategy::Sparse) == tree);
+    }
+
+    #[test]
+    fn a_number_of_points_is_kept_and_more_of_them_reach_the_field(field in any_field(), points in 4usize..200) {
+        let ground = Ground::new(&field, None).unwrap();
+        let tree = by_number(&ground, Criterion::Vertical, points);
+        prop_assert!(tree.points().0 <= points);
+        let all = by_number(&ground, Criterion::Vertical, usize::MAX);
+        prop_assert_eq!(largest_error(&ground, Criterion::Vertical, &all), 0.0);
+    }
+}
+
+#[test]
+fn each_criterion_sees_its_own_fault() {
+    // A plane has none but its slope; a bump has one.
+    let plane: Vec<f64> = (0..SIDE * SIDE).map(|s| (s % SIDE * 20 + s / SIDE * 12) as f64).collect();
+    let mut bump = plane.clone();
+    bump[16 * SIDE + 9] += 50.0;
+    for criterion in [
+        Criterion::Vertical,
+        Criterion::Euclidean,
+        Criterion::Curvature,
+        Criterion::Normal,
+        Criterion::Coefficient,
+    ] {
+        let field = Field::new(5, plane.clone(), [30.0, 30.0]).unwrap();
+        let (tree, _) = select(&Ground::new(&field, None).unwrap(), criterion, 1e-3);
+        assert_eq!(tree.points(), (4, 0), "{criterion:?} on a plane");
+        let field = Field::new(5, bump.clone(), [30.0, 30.0]).unwrap();
+        let ground = Ground::new(&field, None).unwrap();
+        let (tree, _) = select(&ground, criterion, 1e-3);
+        assert_eq!(tree.height([9, 16]), Some(field.at([9, 16])), "{criterion:?} on a bump");
+        // Where nobody looks it does not matter.
+        let mut mask = vec![1.0; SIDE * SIDE];
+        for row in mask.chunks_mut(SIDE) {
+            row[..20].fill(0.0);
+        }
+        let (tree, _) = select(&Ground::new(&field, Some(&mask)).unwrap(), criterion, 1e-3);
+        assert_eq!(tree.points(), (4, 0), "{criterion:?} behind a mask");
+    }
+}
+
+#[test]
+fn a_tilted_plane_is_nearer_at_right_angles_than_upright() {
+    let mut heights: Vec<f64> = (0..SIDE * SIDE).map(|s| (s % SIDE * 30) as f64).collect();
+    heights[16 * SIDE + 16] += 10.0;
+    let field = Field::new(5, heights, [30.0, 30.0]).unwrap();
+    let ground = Ground::new(&field, None).unwrap();
+    let tree = field.tree();
+    assert_eq!(largest_error(&ground, Criterion::Vertical, &tree), 10.0);
+    let right_angled = largest_error(&ground, Criterion::Euclidean, &tree);
+    assert!((right_angled - 10.0 / 2f64.sqrt()).abs() < 1e-12, "{right_angled}");
+}
+
+#[test]
+fn masks_of_the_wrong_size_or_range_are_refused() {
+    let field = Field::new(1, vec![0.0; 9], [1.0, 1.0]).unwrap();
+    assert!(Ground::new(&field, Some(&[1.0; 8])).is_none());
+    assert!(Ground::new(&field, Some(&[1.5; 9])).is_none());
+    assert!(Ground::new(&field, Some(&[0.5; 9])).is_some());
+}

@@ -1,0 +1,65 @@
+//! Selection from the top, level by level.
+//!
+//! Going by levels means that the ends of a hypotenuse have their final heights before its middle is judged,
+//! so each triangle is judged by the surface that it will be part of. A middle that becomes real for the
+//! sake of one triangle moves the other one at the same hypotenuse, too: its halves are judged again, even where the
+//! triangle, or a larger one that it is part of, was good enough before.
+//!
+//! Each triangle scans its samples only until the tolerance is passed; a triangle that is good is scanned
+//! once. So the cost is at most one scan of the field a level, and usually two or three in all.
+
+use super::{Criterion, Ground};
+use diamantina_protocol::bitree::{Bitree, Facet};
+
+/// One bit for each triangle of a grid.
+struct Queued(Vec<u64>);
+
+impl Queued {
+    /// Whether it was not there yet.
+    fn insert(&mut self, path: u32) -> bool {
+        let (word, bit) = (path as usize / 64, 1u64 << (path % 64));
+        let before = self.0[word];
+        self.0[word] |= bit;
+        before & bit == 0
+    }
+}
+
+/// The points of a descent; middles that are off by no more than `share` of the tolerance stay fictitious. By criteria
+/// that are no distances each middle that is off at all is real. Every triangle is within the tolerance
+/// afterwards, down to the finest ones, which cannot split.
+#[must_use]
+pub fn top_down(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, share: f64) -> Bitree {
+    let field = ground.field();
+    let mut tree = field.tree();
+    let finest = 2 * u32::from(field.log2());
+    let mut queued = Queued(vec![0; (4usize << finest).div_ceil(64)]);
+    let mut now = tree.roots().to_vec();
+    for _ in 0..finest {
+        now.retain(|facet| criterion.error(ground, facet, tolerance) > tolerance);
+        let mut moved = Vec::new();
+        for facet in &now {
+            let m = facet.middle();
+            let off = off(ground, facet);
+            let is_off = match criterion.distance(ground, field.slot(m), off) {
+                Some(distance) => distance > share * tolerance,
+                None => off != 0.0,
+            };
+            if is_off && !off.is_nan() && tree.add(m, field.at(m)).is_none() {
+                moved.push(m);
+            }
+        }
+        let across = moved.into_iter().flat_map(|m| tree.around(m)).flatten();
+        let split: Vec<Facet> = now.iter().copied().chain(across).collect();
+        now.clear();
+        for facet in split.into_iter().filter(|facet| queued.insert(facet.path())) {
+            now.extend(tree.halves(&facet));
+        }
+    }
+    tree
+}
+
+/// How far the sample at a triangle's middle is above the hypotenuse; NaN without data.
+fn off(ground: &Ground<'_>, facet: &Facet) -> f64 {
+    let [ha, _, hb] = facet.heights();
+    ground.field().at(facet.middle()) - (ha + hb) / 2.0
+}

@@ -1,0 +1,170 @@
+//! References of triangle strips beside separate triangles, and beside other orders of the same triangles.
+//!
+//! *Strip* is the one strip of the recursion. *Strips* are several, grown greedily from triangle to
+//! neighbour, with one restart reference between two. *Cached* is a list of separate triangles in the recursion's order,
+//! told by the vertices that a first-in first-out cache of 32 has to fetch for it.
+
+use super::report::{Report, Table};
+use super::select::{Ground, Strategy, by_strategy};
+use super::{ExperimentError, Run};
+use diamantina_protocol::bintree::Point;
+use diamantina_protocol::bitree::{Bitree, strip};
+use std::collections::{BTreeMap, VecDeque};
+
+/// Vertices that the cache of a graphics processor is taken to hold.
+const CACHE: usize = 32;
+
+pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
+    let columns = [
+        "DEM",
+        "x",
+        "y",
+        "tolerance [%]",
+        "triangles",
+        "separate references",
+        "line triangles",
+        "strip references",
+        "saved [%]",
+        "strips",
+        "strips' references",
+        "saved [%]",
+        "cached: fetches a triangle",
+    ];
+    let caption = "Orders of the bitree's triangles; 'full' is every sample of the grid";
+    let mut table = Table::new("strips", caption, &columns);
+    let steps = run.windows.len() * (run.options.tolerances.len() + 1);
+    run.progress.stage("ordering", "meshes", steps as u64, 0);
+    for window in run.windows {
+        let Some(ground) = Ground::new(&window.field, window.weights.as_deref()) else { continue };
+        let mut push = |label: String, tree: &Bitree| {
+            let place = [window.source.clone(), window.at[0].to_string(), window.at[1].to_string(), label];
+            table.push(place.into_iter().chain(row(tree)));
+            run.progress.advance(1);
+        };
+        push("full".to_owned(), &window.field.full_tree());
+        for percent in &run.options.tolerances {
+            if run.progress.is_stopping() {
+                return Err(ExperimentError::Stopped);
+            }
+            let tolerance = percent / 100.0 * window.field.relief();
+            let tree = by_strategy(&ground, run.options.criterion, tolerance, Strategy::Compact);
+            push(percent.to_string(), &tree);
+        }
+    }
+    Ok(Report {
+        title: "Triangle strips".to_owned(),
+        notes: vec!["Separate triangles take three references each.".to_owned()],
+        tables: vec![table],
+        pictures: Vec::new(),
+    })
+}
+
+fn row(tree: &Bitree) -> Vec<String> {
+    let one = strip::strip(tree);
+    let triangles = strip::triangles(&one);
+    let several = greedy_strips(&triangles);
+    let references = several.iter().map(Vec::len).sum::<usize>() + several.len().saturating_sub(1);
+    let separate = 3 * triangles.len();
+    let saved = |references: usize| format!("{:.1}", 100.0 * (1.0 - references as f64 / separate as f64));
+    vec![
+        triangles.len().to_string(),
+        separate.to_string(),
+        strip::line_triangles(&one).to_string(),
+        one.len().to_string(),
+        saved(one.len()),
+        several.len().to_string(),
+        references.to_string(),
+        saved(references),
+        format!("{:.3}", fetches(&triangles) as f64 / triangles.len() as f64),
+    ]
+}
+
+/// Vertices that a first-in first-out cache has to fetch for triangles in their order.
+fn fetches(triangles: &[[Point; 3]]) -> usize {
+    let mut cache: VecDeque<Point> = VecDeque::with_capacity(CACHE + 1);
+    let mut count = 0;
+    for point in triangles.iter().flatten() {
+        if !cache.contains(point) {
+            count += 1;
+            cache.push_back(*point);
+            if cache.len() > CACHE {
+                cache.pop_front();
+            }
+        }
+    }
+    count
+}
+
+/// A side, the smaller end first.
+fn side(u: Point, v: Point) -> [Point; 2] {
+    if u <= v { [u, v] } else { [v, u] }
+}
+
+/// Strips that draw each triangle once: each starts at the first triangle left, in whichever of its three
+/// ways goes on the longest, and goes from side to side while a triangle with that whole side is left.
+fn greedy_strips(triangles: &[[Point; 3]]) -> Vec<Vec<Point>> {
+    let mut by_side: BTreeMap<[Point; 2], Vec<usize>> = BTreeMap::new();
+    for (i, [a, b, c]) in triangles.iter().enumerate() {
+        for s in [side(*a, *b), side(*b, *c), side(*c, *a)] {
+            by_side.entry(s).or_default().push(i);
+        }
+    }
+    let mut used = vec![false; triangles.len()];
+    let mut strips = Vec::new();
+    for start in 0..triangles.len() {
+        if used[start] {
+            continue;
+        }
+        let [a, b, c] = triangles[start];
+        let ways = [[a, b, c], [b, c, a], [c, a, b], [a, c, b], [c, b, a], [b, a, c]];
+        let grown = ways.map(|way| grow(triangles, &by_side, &used, start, way));
+        let Some((strip, members)) = grown.into_iter().max_by_key(|(strip, _)| strip.len()) else { continue };
+        members.into_iter().for_each(|i| used[i] = true);
+        strips.push(strip);
+    }
+    strips
+}
+
+fn grow(
+    triangles: &[[Point; 3]],
+    by_side: &BTreeMap<[Point; 2], Vec<usize>>,
+    used: &[bool],
+    start: usize,
+    way: [Point; 3],
+) -> (Vec<Point>, Vec<usize>) {
+    let (mut strip, mut members) = (way.to_vec(), vec![start]);
+    while let [.., u, v] = strip[..]
+        && let Some(next) =
+            by_side.get(&side(u, v)).and_then(|list| list.iter().find(|i| !used[**i] && !members.contains(i)))
+    {
+        strip.extend(triangles[*next].into_iter().filter(|p| *p != u && *p != v));
+        members.push(*next);
+    }
+    (strip, members)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn greedy_strips_draw_each_triangle_once(
+            points in prop::collection::vec([0u32..=16, 0u32..=16], 0..40)
+        ) {
+            let mut tree = Bitree::new(4, [0.0; 4]).unwrap();
+            for p in points { tree.add(p, 1.0); }
+            let sorted = |list: Vec<[Point; 3]>| {
+                let mut list: Vec<_> = list.into_iter().map(|mut t| { t.sort_unstable(); t }).collect();
+                list.sort_unstable();
+                list
+            };
+            let one = strip::triangles(&strip::strip(&tree));
+            let several = greedy_strips(&one);
+            let drawn = several.iter().flat_map(|s| strip::triangles(s)).collect();
+            prop_assert!(several.iter().all(|s| strip::line_triangles(s) == 0));
+            prop_assert_eq!(sorted(drawn), sorted(one));
+        }
+    }
+}

@@ -1,0 +1,272 @@
+//! Bitree and restricted quadtree within tolerances: the bitree paper's first table, over any windows.
+//!
+//! Two quadtrees stand beside each bitree. *Closed* is the paper's comparison: the points that the bitree selected, with
+//! all that they depend on. *Own* is what the quadtree selects for itself within the same tolerance:
+//! its smallest, and the harder one to beat. Strips of all are by the same recursion. Whoever selects, the error
+//! is measured anew, over all samples.
+
+use super::report::{Picture, Report, Table};
+use super::select::{Ground, Strategy, by_strategy, largest_error};
+use super::windows::Window;
+use super::{Criterion, ExperimentError, Run, mean_and_spread, plot, quadtree};
+use diamantina_protocol::bitree::{Bitree, strip};
+use std::collections::BTreeMap;
+
+/// What is counted of a mesh.
+#[derive(Debug, Clone, Copy)]
+struct Counts {
+    /// Real points, corners included.
+    transmitted: usize,
+    /// Points that only complete the triangulation.
+    added: usize,
+    triangles: usize,
+    references: usize,
+    /// Metres.
+    error: f64,
+}
+
+/// One bitree with its two baselines.
+#[derive(Debug, Clone, Copy)]
+struct Outcome {
+    bitree: Counts,
+    closed: Counts,
+    own: Counts,
+}
+
+fn counts(ground: &Ground<'_>, tree: &Bitree, added: usize) -> Counts {
+    Counts {
+        transmitted: tree.points().0,
+        added,
+        triangles: tree.triangle_count(),
+        references: strip::strip(tree).len(),
+        error: largest_error(ground, Criterion::Vertical, tree),
+    }
+}
+
+/// Everything at one tolerance, in metres (or the criterion's own unit).
+fn outcome(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, strategy: Strategy) -> Outcome {
+    let field = ground.field();
+    let bitree = by_strategy(ground, criterion, tolerance, strategy);
+    let closed = quadtree::close(field, &bitree);
+    let own = quadtree::select(field, tolerance, |facet, enough| criterion.error(ground, facet, enough));
+    let (real, fictitious) = bitree.points();
+    Outcome {
+        bitree: counts(ground, &bitree, fictitious),
+        closed: counts(ground, &closed, closed.points().0 - real),
+        own: counts(ground, &own, 0),
+    }
+}
+
+/// Percent that the first saves of the second.
+fn saving(ours: usize, theirs: usize) -> f64 {
+    100.0 * (1.0 - ours as f64 / theirs.max(1) as f64)
+}
+
+pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
+    let strategies = match run.options.criterion {
+        Criterion::Coefficient => vec![Strategy::Direct],
+        _ => vec![Strategy::Compact, Strategy::Sparse, Strategy::Greedy],
+    };
+    let steps = run.windows.len() * run.options.tolerances.len();
+    run.progress.stage("selecting", "selections", steps as u64, 0);
+    let mut found: BTreeMap<(usize, Strategy), Vec<Outcome>> = BTreeMap::new();
+    let mut each = each_table();
+    for window in run.windows {
+        let weights = window.weights.as_deref();
+        let Some(ground) = Ground::new(&window.field, weights) else { continue };
+        for (i, percent) in run.options.tolerances.iter().enumerate() {
+            if run.progress.is_stopping() {
+                return Err(ExperimentError::Stopped);
+            }
+            let tolerance = percent / 100.0 * window.field.relief();
+            for strategy in &strategies {
+                let outcome = outcome(&ground, run.options.criterion, tolerance, *strategy);
+                push_each(&mut each, window, *percent, *strategy, &outcome);
+                found.entry((i, *strategy)).or_default().push(outcome);
+            }
+            run.progress.advance(1);
+        }
+    }
+    let tables = vec![means_table(run, &found), savings_table(run, &found), each];
+    let pictures = vec![savings_plot(run, &found, strategies[0])?];
+    let notes = vec![
+        format!(
+            "{} windows of {} x {} samples; criterion {:?}; tolerances in percent of each window's relief.",
+            run.windows.len(),
+            run.options.windows.samples,
+            run.options.windows.samples,
+            run.options.criterion
+        ),
+        "Closed: the bitree's own points with all that a restricted quadtree makes them depend on. Own: the \
+         smallest restricted quadtree within the same tolerance. A bitree transmits its real points, a quadtree all."
+            .to_owned(),
+        format!("Fewest points, then triangles, in the mean: {}.", best(&found, &run.options.tolerances)),
+    ];
+    Ok(Report {
+        title: "Bitree and restricted quadtree within tolerances".to_owned(),
+        notes,
+        tables,
+        pictures,
+    })
+}
+
+/// The strategy with the fewest points, then triangles, at each tolerance.
+fn best(found: &BTreeMap<(usize, Strategy), Vec<Outcome>>, tolerances: &[f64]) -> String {
+    let size = |list: &[Outcome]| -> (usize, usize) {
+        (list.iter().map(|o| o.bitree.transmitted).sum(), list.iter().map(|o| o.bitree.triangles).sum())
+    };
+    let of = |i: usize| found.iter().filter(|((at, _), _)| *at == i).min_by_key(|(_, list)| size(list));
+    let names = tolerances
+        .iter()
+        .enumerate()
+        .filter_map(|(i, percent)| of(i).map(|((_, strategy), _)| format!("{strategy} at {percent} %")));
+    names.collect::<Vec<_>>().join(", ")
+}
+
+const EACH: [&str; 23] = [
+    "DEM",
+    "x",
+    "y",
+    "tolerance [%]",
+    "strategy",
+    "BT added",
+    "closed QT added",
+    "BT transmitted",
+    "closed QT transmitted",
+    "own QT transmitted",
+    "saved of closed [%]",
+    "saved of own [%]",
+    "BT triangles",
+    "closed QT triangles",
+    "own QT triangles",
+    "saved of closed [%]",
+    "saved of own [%]",
+    "BT references",
+    "closed QT references",
+    "own QT references",
+    "BT error [m]",
+    "closed QT error [m]",
+    "own QT error [m]",
+];
+
+fn each_table() -> Table {
+    Table::new("windows", "Each window: bitree (BT), restricted quadtree (QT)", &EACH)
+}
+
+fn push_each(table: &mut Table, window: &Window, percent: f64, strategy: Strategy, o: &Outcome) {
+    let all = [o.bitree, o.closed, o.own];
+    let mut row = vec![window.source.clone(), window.at[0].to_string(), window.at[1].to_string()];
+    row.extend([percent.to_string(), strategy.to_string()]);
+    row.extend([o.bitree.added, o.closed.added].map(|n| n.to_string()));
+    for count in [|c: Counts| c.transmitted, |c: Counts| c.triangles] {
+        row.extend(all.map(|c| count(c).to_string()));
+        row.extend([o.closed, o.own].map(|c| format!("{:.1}", saving(count(o.bitree), count(c)))));
+    }
+    row.extend(all.map(|c| c.references.to_string()));
+    row.extend(all.map(|c| format!("{:.3}", c.error)));
+    table.push(row);
+}
+
+fn means_table(run: &Run<'_>, found: &BTreeMap<(usize, Strategy), Vec<Outcome>>) -> Table {
+    let columns = [
+        "tolerance [%]",
+        "strategy",
+        "BT added",
+        "closed QT added",
+        "BT transmitted",
+        "closed QT transmitted",
+        "own QT transmitted",
+        "BT triangles",
+        "closed QT triangles",
+        "own QT triangles",
+        "BT references",
+        "closed QT references",
+        "own QT references",
+        "largest BT error [% of tolerance]",
+    ];
+    let mut table = Table::new("means", "Means over all windows", &columns);
+    for ((i, strategy), list) in found {
+        let mean = |count: &dyn Fn(&Outcome) -> usize| {
+            let values: Vec<f64> = list.iter().map(|o| count(o) as f64).collect();
+            format!("{:.1}", mean_and_spread(&values)[0])
+        };
+        let percent = run.options.tolerances[*i];
+        let worst = list.iter().zip(run.windows).map(|(o, w)| {
+            let tolerance = percent / 100.0 * w.field.relief();
+            if o.bitree.error == 0.0 { 0.0 } else { 100.0 * o.bitree.error / tolerance }
+        });
+        let mut row = vec![percent.to_string(), strategy.to_string()];
+        row.extend([mean(&|o| o.bitree.added), mean(&|o| o.closed.added)]);
+        for count in [|c: Counts| c.transmitted, |c: Counts| c.triangles, |c: Counts| c.references] {
+            row.extend([mean(&|o| count(o.bitree)), mean(&|o| count(o.closed)), mean(&|o| count(o.own))]);
+        }
+        row.push(format!("{:.1}", worst.fold(0.0, f64::max)));
+        table.push(row);
+    }
+    table
+}
+
+/// Savings of points, triangles and references, of closed and own, mean and spread.
+fn savings(list: &[Outcome]) -> [[f64; 2]; 6] {
+    let of = |count: fn(Counts) -> usize, theirs: fn(&Outcome) -> Counts| {
+        let all = list.iter().map(|o| saving(count(o.bitree), count(theirs(o))));
+        mean_and_spread(&all.collect::<Vec<_>>())
+    };
+    let (closed, own) = (|o: &Outcome| o.closed, |o: &Outcome| o.own);
+    [
+        of(|c| c.transmitted, closed),
+        of(|c| c.triangles, closed),
+        of(|c| c.references, closed),
+        of(|c| c.transmitted, own),
+        of(|c| c.triangles, own),
+        of(|c| c.references, own),
+    ]
+}
+
+fn savings_table(run: &Run<'_>, found: &BTreeMap<(usize, Strategy), Vec<Outcome>>) -> Table {
+    let columns = [
+        "tolerance [%]",
+        "strategy",
+        "points of closed",
+        "triangles of closed",
+        "references of closed",
+        "points of own",
+        "triangles of own",
+        "references of own",
+    ];
+    let caption =
+        "What the bitree saves, percent of the quadtree's: mean of the windows ± standard deviation";
+    let mut table = Table::new("savings", caption, &columns);
+    for ((i, strategy), list) in found {
+        let cells = savings(list).map(|[mean, spread]| format!("{mean:.1} ± {spread:.1}"));
+        table.push([run.options.tolerances[*i].to_string(), strategy.to_string()].into_iter().chain(cells));
+    }
+    table
+}
+
+fn savings_plot(
+    run: &Run<'_>,
+    found: &BTreeMap<(usize, Strategy), Vec<Outcome>>,
+    strategy: Strategy,
+) -> Result<Picture, ExperimentError> {
+    let names = [
+        "points, closed",
+        "triangles, closed",
+        "references, closed",
+        "points, own",
+        "triangles, own",
+        "references, own",
+    ];
+    let mut series: Vec<plot::Series> =
+        names.iter().map(|n| plot::Series { name: (*n).to_owned(), points: Vec::new() }).collect();
+    for ((i, _), list) in found.iter().filter(|((_, s), _)| *s == strategy) {
+        for (line, [mean, _]) in series.iter_mut().zip(savings(list)) {
+            line.points.push([run.options.tolerances[*i], mean]);
+        }
+    }
+    let axes = ["tolerance [% of relief]", "saved [%]"];
+    let title = format!("Saved by the bitree ({strategy}) of the restricted quadtree's");
+    let bytes = plot::lines(&title, axes, false, &series)?;
+    let caption = "Mean savings of points to transmit, triangles and strip references.".to_owned();
+    Ok(Picture { file: "savings.svg".to_owned(), caption, bytes })
+}
