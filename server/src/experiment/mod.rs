@@ -15,13 +15,16 @@ pub mod quadtree;
 pub mod report;
 pub mod scan;
 pub mod select;
+pub mod view;
 pub mod windows;
 
+mod by_curvature;
 mod strips;
 mod tolerances;
 
 use crate::ingest::IngestError;
 use crate::progress::Progress;
+use diamantina_protocol::bintree::Point;
 use report::Report;
 use select::Criterion;
 use std::path::PathBuf;
@@ -41,6 +44,15 @@ pub struct Options {
     /// Weights of samples: a raster of numbers from 0 to 1 on the DEM's own grid; no data counts as 0
     #[arg(long, value_name = "RASTER")]
     pub(crate) mask: Option<PathBuf>,
+    /// Where the observer stands, in samples from the window's south-west corner [default: the highest of its southern eighth]
+    #[arg(long, value_name = "X,Y", value_parser = windows::parse_place)]
+    pub(crate) observer: Option<Point>,
+    /// Metres of the observer's eye above the ground
+    #[arg(long, default_value_t = 50.0, value_name = "METRES")]
+    pub(crate) eye: f64,
+    /// How much distance forgives: a in T (a d / D + 1)
+    #[arg(long, default_value_t = 20.0, value_name = "A")]
+    pub(crate) forgiveness: f64,
 }
 
 /// One run of an experiment.
@@ -73,6 +85,11 @@ pub const ALL: &[Experiment] = &[
         name: "strips",
         about: "references of triangle strips beside separate triangles and other orders",
         run: strips::run,
+    },
+    Experiment {
+        name: "curvature",
+        about: "polygons by local curvature, and the pixels that an observer sees change",
+        run: by_curvature::run,
     },
 ];
 
