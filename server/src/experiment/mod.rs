@@ -16,13 +16,16 @@ pub mod quadtree;
 pub mod report;
 pub mod scan;
 pub mod select;
+pub mod view;
 pub mod windows;
 
+mod by_curvature;
 mod strips;
 mod tolerances;
 
 use crate::ingest::IngestError;
 use crate::progress::Progress;
+use diamantina_protocol::bintree::Point;
 use report::Report;
 use select::Criterion;
 use std::path::PathBuf;
@@ -44,6 +47,15 @@ pub struct Options {
     pub(crate) mask: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) flights: lod::Options,
+    /// Where the observer stands, in samples from the window's south-west corner [default: the highest of its southern eighth]
+    #[arg(long, value_name = "X,Y", value_parser = windows::parse_place)]
+    pub(crate) observer: Option<Point>,
+    /// Metres of the observer's eye above the ground
+    #[arg(long, default_value_t = 50.0, value_name = "METRES")]
+    pub(crate) eye: f64,
+    /// How much distance forgives: a in T (a d / D + 1)
+    #[arg(long, default_value_t = 20.0, value_name = "A")]
+    pub(crate) forgiveness: f64,
 }
 
 /// One run of an experiment.
@@ -100,6 +112,11 @@ pub const ALL: &[Experiment] = &[
         name: "lod",
         about: "bytes and triangles of flights with each term of the client's level of detail on and off",
         work: Work::Whole(lod::run),
+    },
+    Experiment {
+        name: "curvature",
+        about: "polygons by local curvature, and the pixels that an observer sees change",
+        work: Work::Windows(by_curvature::run),
     },
 ];
 

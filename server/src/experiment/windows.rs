@@ -43,7 +43,7 @@ pub struct Options {
     pub(crate) at: Option<Point>,
 }
 
-fn parse_place(text: &str) -> Result<Point, String> {
+pub(super) fn parse_place(text: &str) -> Result<Point, String> {
     let parts =
         text.split_once(',').and_then(|(x, y)| Some([x.trim().parse().ok()?, y.trim().parse().ok()?]));
     parts.ok_or_else(|| format!("expected X,Y in samples from the south-west corner, found '{text}'"))

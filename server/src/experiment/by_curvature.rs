@@ -1,0 +1,183 @@
+//! Polygons by local curvature: plain, from an observer's place, behind a mask, and both; and what the observer
+//! sees of the difference.
+//!
+//! For each share of the polygons of the full grid the threshold is found by bisection, since thresholds mean
+//! nothing by themselves. The mask is the one given, or what the observer sees of the full field: every sample
+//! that some pixel shows, and its neighbours.
+
+use super::curvature::quadtree::{Observer, Quadtree, Sums};
+use super::curvature::templates;
+use super::field::Field;
+use super::report::{Picture, Report, Table};
+use super::view::{self, Eye, View};
+use super::windows::Window;
+use super::{ExperimentError, Run, plot};
+use diamantina_protocol::bintree::Point;
+
+/// Percent of the full grid's polygons that are tried.
+const SHARES: [f64; 6] = [50.0, 20.0, 10.0, 7.0, 5.0, 2.0];
+/// The share that is pictured.
+const PICTURED: f64 = 7.0;
+/// Halvings of the interval of a threshold's logarithm; the last are finer than any polygon.
+const BISECTIONS: usize = 40;
+
+const COLUMNS: [&str; 9] = [
+    "DEM",
+    "rule",
+    "share asked [%]",
+    "threshold T",
+    "polygons",
+    "share [%]",
+    "RMS error [m]",
+    "pixels changed [%]",
+    "mean difference [shades]",
+];
+
+pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
+    let mut table = Table::new("curvature", "Polygons by curvature and what the observer sees", &COLUMNS);
+    let mut pictures = Vec::new();
+    run.progress.stage("splitting", "meshes", (run.windows.len() * SHARES.len() * 4) as u64, 0);
+    for (i, window) in run.windows.iter().enumerate() {
+        one(run, i, window, &mut table, &mut pictures)?;
+    }
+    let o = run.options;
+    let notes = vec![
+        format!(
+            "The observer stands {} m above the ground{}; distance forgives with a = {}.",
+            o.eye,
+            o.observer.map_or(String::new(), |[x, y]| format!(" at sample {x}, {y}")),
+            o.forgiveness
+        ),
+        "Pixels count as changed beyond 8 of 255 shades.".to_owned(),
+    ];
+    Ok(Report { title: "Simplification by curvature".to_owned(), notes, tables: vec![table], pictures })
+}
+
+/// One rule with its sums.
+struct Rule {
+    name: &'static str,
+    sums: Sums,
+    observer: Option<Observer>,
+}
+
+fn one(
+    run: &Run<'_>,
+    number: usize,
+    window: &Window,
+    table: &mut Table,
+    pictures: &mut Vec<Picture>,
+) -> Result<(), ExperimentError> {
+    let field = &window.field;
+    let eye = eye(run, field);
+    let full = view::render(field, field.heights(), eye);
+    let mask = window.weights.clone().unwrap_or_else(|| grown(field, &full.seen));
+    let observer = Observer { at: eye.at, forgiveness: run.options.forgiveness };
+    let rules = [
+        Rule { name: "plain", sums: Sums::new(field, None), observer: None },
+        Rule { name: "view", sums: Sums::new(field, None), observer: Some(observer) },
+        Rule { name: "mask", sums: Sums::new(field, Some(&mask)), observer: None },
+        Rule { name: "view and mask", sums: Sums::new(field, Some(&mask)), observer: Some(observer) },
+    ];
+    let mut series = Vec::new();
+    pictures.push(png(format!("{number}-full.png"), "All polygons, from the observer's place", &full)?);
+    for rule in &rules {
+        let mut points = Vec::new();
+        for share in SHARES {
+            if run.progress.is_stopping() {
+                return Err(ExperimentError::Stopped);
+            }
+            let (threshold, mesh) = with_share(field, rule, share / 100.0);
+            let surface = view::surface(field, &mesh);
+            let seen = view::render(field, &surface, eye);
+            let [changed, mean] = view::difference(&full, &seen);
+            let polygons = mesh.len() as f64 / full_polygons(field) * 100.0;
+            let row =
+                [window.source.clone(), rule.name.to_owned(), share.to_string(), format!("{threshold:.4e}")];
+            let rms = rms(field, &surface);
+            let cells = [
+                format!("{polygons:.2}"),
+                format!("{rms:.2}"),
+                format!("{changed:.2}"),
+                format!("{mean:.2}"),
+            ];
+            table.push(row.into_iter().chain([mesh.len().to_string()]).chain(cells));
+            points.push([polygons, changed]);
+            if share == PICTURED {
+                let file = rule.name.replace(' ', "-");
+                let about = format!(
+                    "{} rule, {polygons:.1} % of the polygons: {changed:.2} % of the pixels change",
+                    rule.name
+                );
+                pictures.push(png(format!("{number}-{file}.png"), &about, &seen)?);
+                let bytes = plot::mesh(field.side(), &mesh);
+                pictures.push(Picture { file: format!("{number}-{file}-mesh.svg"), caption: about, bytes });
+            }
+            run.progress.advance(1);
+        }
+        series.push(plot::Series { name: rule.name.to_owned(), points });
+    }
+    let axes = ["polygons [% of the full grid]", "pixels changed [%]"];
+    let bytes = plot::lines(&format!("{}: what the observer notices", window.source), axes, false, &series)?;
+    pictures.push(Picture {
+        file: format!("{number}-pixels.svg"),
+        caption: "Pixels against polygons".to_owned(),
+        bytes,
+    });
+    Ok(())
+}
+
+fn png(file: String, caption: &str, view: &View) -> Result<Picture, ExperimentError> {
+    let bytes = view::png(view).map_err(|e| ExperimentError::Plot(e.to_string()))?;
+    Ok(Picture { file, caption: caption.to_owned(), bytes })
+}
+
+/// The observer of the options, or on the highest sample of the southern eighth; looks at the field's middle.
+fn eye(run: &Run<'_>, field: &Field) -> Eye {
+    let side = f64::from(field.side());
+    let strip = (field.row() / 8 + 1) * field.row();
+    let known = (0..strip).filter(|slot| !field.heights()[*slot].is_nan());
+    let highest = known.max_by(|a, b| field.heights()[*a].total_cmp(&field.heights()[*b])).unwrap_or(0);
+    let [x, y] = run.options.observer.unwrap_or_else(|| field.point(highest)).map(|v| v.min(field.side()));
+    let [low, high] = field.range();
+    let ground = Some(field.at([x, y])).filter(|h| !h.is_nan()).unwrap_or(low.midpoint(high));
+    let at = [f64::from(x), f64::from(y)];
+    Eye { at, height: ground + run.options.eye, towards: [0.5 * side, 0.55 * side] }
+}
+
+fn full_polygons(field: &Field) -> f64 {
+    2.0 * f64::from(field.side()).powi(2)
+}
+
+/// The smallest threshold, up to the last bisection, that leaves at most a share of the polygons.
+fn with_share(field: &Field, rule: &Rule, share: f64) -> (f64, Vec<[Point; 3]>) {
+    let mesh =
+        |threshold: f64| templates::triangles(&Quadtree::new(field, &rule.sums, threshold, rule.observer));
+    let (mut low, mut high) = (1e-9f64.ln(), 1e9f64.ln());
+    for _ in 0..BISECTIONS {
+        let middle = f64::midpoint(low, high);
+        if mesh(middle.exp()).len() as f64 > share * full_polygons(field) {
+            low = middle
+        } else {
+            high = middle
+        }
+    }
+    (high.exp(), mesh(high.exp()))
+}
+
+/// Root mean square of the vertical distances at samples that both have.
+fn rms(field: &Field, surface: &[f64]) -> f64 {
+    let squares = field.heights().iter().zip(surface).map(|(a, b)| (a - b) * (a - b)).filter(|s| !s.is_nan());
+    let (sum, n) = squares.fold((0.0, 0u32), |(sum, n), s| (sum + s, n + 1));
+    (sum / f64::from(n.max(1))).sqrt()
+}
+
+/// What is seen and one sample around it.
+fn grown(field: &Field, seen: &[bool]) -> Vec<f32> {
+    let row = field.row();
+    let near = |slot: usize| {
+        let (x, y) = (slot % row, slot / row);
+        (y.saturating_sub(1)..=(y + 1).min(row - 1))
+            .any(|j| (x.saturating_sub(1)..=(x + 1).min(row - 1)).any(|i| seen[j * row + i]))
+    };
+    (0..seen.len()).map(|slot| if near(slot) { 1.0 } else { 0.0 }).collect()
+}
