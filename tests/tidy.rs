@@ -44,17 +44,18 @@ const CLIENT: &[(&str, &[&str])] = &[
     ("camera", &[]),
     ("surface", &[]),
     ("picture", &[]),
-    ("drawing", &["surface"]),
+    ("morph", &["surface"]),
+    ("drawing", &["morph", "surface"]),
     ("cache", &["surface"]),
     ("fetch", &[]),
-    ("cut", &["camera", "drawing", "surface"]),
-    ("terrain", &["cache", "camera", "cut", "drawing", "fetch", "surface"]),
-    ("render", &["camera", "drawing", "picture", "surface"]),
+    ("cut", &["camera", "drawing", "morph", "surface"]),
+    ("terrain", &["cache", "camera", "cut", "drawing", "fetch", "morph", "surface"]),
+    ("render", &["camera", "drawing", "morph", "picture", "surface"]),
     ("headless", &["camera", "fetch", "picture", "render", "terrain"]),
     ("viewer", &["camera", "fetch", "headless", "render", "terrain"]),
     ("web", &["viewer"]),
     // The made scene of the crate's own tests.
-    ("world", &["camera", "surface"]),
+    ("world", &["camera", "drawing", "surface"]),
 ];
 
 /// Lines that a file may have.

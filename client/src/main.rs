@@ -4,6 +4,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use diamantina_client::camera::{Camera, FOV_Y};
 use diamantina_client::fetch::FetchError;
 use diamantina_client::headless::{self, Flight, FlightPath, FrameLine, PictureReport};
+use diamantina_client::morph;
 use diamantina_client::render::{self, Background, Colours, Look, Sun};
 use diamantina_client::terrain::{self, Terrain, TerrainError};
 use diamantina_protocol::message::Scene;
@@ -125,6 +126,9 @@ struct FlyArgs {
     /// Frames a second at most; 0: as fast as they can be drawn
     #[arg(long, default_value_t = 30.0, value_name = "N")]
     fps: f64,
+    /// Seconds of the path that the surface takes to move whenever its level of detail changes, up to 60; 0: it jumps
+    #[arg(long, default_value_t = 0.0, value_name = "SECONDS")]
+    morph: f64,
     /// Write a line for each frame here (- for standard output)
     #[arg(long, value_name = "CSV")]
     csv: Option<PathBuf>,
@@ -217,7 +221,7 @@ fn main() -> ExitCode {
 }
 
 impl ViewArgs {
-    fn open(&self) -> Result<Terrain, Failure> {
+    fn open(&self, morph_seconds: f64) -> Result<Terrain, Failure> {
         if !(self.error_pixels.is_finite() && self.error_pixels > 0.0) {
             return Err(Failure(
                 2,
@@ -237,6 +241,7 @@ impl ViewArgs {
         let options = terrain::Options {
             tolerance_pixels: self.error_pixels,
             memory_bytes: self.memory << 20,
+            morph_seconds,
             encoding,
             ..terrain::Options::default()
         };
@@ -274,7 +279,7 @@ impl ViewArgs {
 fn render(args: &RenderArgs) -> Result<(), Failure> {
     let patience = Duration::try_from_secs_f64(args.timeout)
         .map_err(|_| Failure(2, format!("--timeout {}: expected seconds, 0 or more", args.timeout)))?;
-    let mut terrain = args.view.open()?;
+    let mut terrain = args.view.open(0.0)?;
     let ViewArgs { size, exaggeration, .. } = args.view;
     let camera = match (args.eye, args.target) {
         (Some(eye), Some(target)) if eye == target => {
@@ -349,8 +354,12 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
     if !(args.fps.is_finite() && args.fps >= 0.0) {
         return Err(Failure(2, format!("--fps {}: expected 0 or more", args.fps)));
     }
+    if !(0.0..=morph::SECONDS_MAX).contains(&args.morph) {
+        let max = morph::SECONDS_MAX;
+        return Err(Failure(2, format!("--morph {}: expected seconds from 0 to {max}", args.morph)));
+    }
     let path = args.path.as_deref().map(FlightPath::read).transpose()?;
-    let mut terrain = args.view.open()?;
+    let mut terrain = args.view.open(args.morph)?;
     let path = path.unwrap_or_else(|| FlightPath::round(terrain.scene()));
     let mut csv = args.csv.as_deref().map(headless::open_text).transpose()?;
     if let Some(out) = &mut csv {
