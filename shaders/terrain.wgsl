@@ -9,7 +9,19 @@ struct Vertex {
     // The instance's: lattice point (0, 0) relative to the reference point; lattice steps of u and v.
     @location(3) origin: vec2<i32>,
     @location(4) axes: vec4<i32>,
-    @location(5) level: vec2<i32>,
+    // x: the level. y: the moment to draw, in ticks. z: ticks that a motion takes.
+    @location(5) about: vec3<i32>,
+}
+
+// The motion of a point: see client/src/morph.rs.
+struct Motion {
+    // Quanta above its own height, from and to.
+    @location(6) lift: vec2<f32>,
+    // The normal's east and north, from and to.
+    @location(7) from_normal: vec2<f32>,
+    @location(8) to_normal: vec2<f32>,
+    // The moment of its start, in ticks.
+    @location(9) start: i32,
 }
 
 struct Shaded {
@@ -19,20 +31,37 @@ struct Shaded {
     @location(1) level: f32,
 }
 
-// Up to the conversion to f32 all is exact, and from there on a function of the lattice point and the
-// height alone: so two diamonds give a point that they share the same bits.
-@vertex
-fn terrain_vertex(vertex: Vertex) -> Shaded {
+// A point drawn `lift` quanta above its own height. Up to the conversion to f32 all is exact, and from there on a
+// function of the lattice point, the height and the lift alone: so two diamonds give a point that they share the same
+// bits, whether they move or not.
+fn shaded(vertex: Vertex, lift: f32, normal: vec2<f32>) -> Shaded {
     let p = vec2<i32>(vertex.place);
     let lattice = vertex.origin + ((vertex.axes.xy * p.x + vertex.axes.zw * p.y) >> vec2<u32>(1u));
     let across = vec2<f32>(lattice) * layer.cell + layer.offset;
-    let up = f32(vertex.height - layer.height) * layer.quantum + layer.up_offset;
+    let still = f32(vertex.height - layer.height) * layer.quantum + layer.up_offset;
+    let up = select(still + lift * layer.quantum, still, lift == 0.0);
     let from_eye = vec3<f32>(across, up);
     return Shaded(
         frame.clip_from_eye * vec4<f32>(from_eye, 1.0),
-        vec4<f32>(vertex.normal, up, length(from_eye)),
-        f32(vertex.level.x),
+        vec4<f32>(normal, up, length(from_eye)),
+        f32(vertex.about.x),
     );
+}
+
+@vertex
+fn terrain_vertex(vertex: Vertex) -> Shaded {
+    return shaded(vertex, 0.0, vertex.normal);
+}
+
+// On the way from one cut to the next. At the end of its way a point is where it goes to, bit for bit.
+@vertex
+fn terrain_morph_vertex(vertex: Vertex, motion: Motion) -> Shaded {
+    let age = vertex.about.y - motion.start;
+    let t = clamp(f32(age) / f32(vertex.about.z), 0.0, 1.0);
+    let weight = t * t * (3.0 - 2.0 * t);
+    let on_the_way = motion.lift.x + (motion.lift.y - motion.lift.x) * weight;
+    let lift = select(on_the_way, motion.lift.y, age >= vertex.about.z);
+    return shaded(vertex, lift, mix(motion.from_normal, motion.to_normal, weight));
 }
 
 // Linear interpolation between the colours on both sides of t.

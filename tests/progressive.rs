@@ -6,6 +6,7 @@ use crate::truth::{Check, Samples, Verdict};
 use crate::world::{Dice, Faults, Proxy, World, build, options, programs, write_raw};
 use diamantina_client::camera::Camera;
 use diamantina_client::cut::{self, Ask};
+use diamantina_client::sight::Sight;
 use diamantina_client::terrain::{self, Terrain};
 use diamantina_client::{fetch, headless};
 use diamantina_protocol::NODATA;
@@ -267,6 +268,8 @@ fn every_prefix_covers_the_forest_once_without_cracks() {
         camera: &camera,
         exaggeration: 1.0,
         tolerance_pixels: 1e-9,
+        sight: Sight::default(),
+        seen: None,
         memory_bytes: usize::MAX,
     };
     let ideal = cut::choose(&ask, |d| Some(entries[&d]));
@@ -285,7 +288,7 @@ fn every_prefix_covers_the_forest_once_without_cracks() {
             shared += assert_no_cracks(&layer, &drawing.items, false);
             let all_roots = roots == layer.forest.root_diamonds().filter(|r| !entries[r].is_empty()).count();
             assert_eq!(drawing.items.is_empty(), !all_roots, "something is drawn from the last root on");
-            assert!(!all_roots || drawing.splits == reader.order.len(), "all that arrived is drawn");
+            assert!(!all_roots || drawing.splits.len() == reader.order.len(), "all that arrived is drawn");
         }
         assert!(shared > 0, "{question:?}");
     }

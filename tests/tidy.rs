@@ -45,18 +45,19 @@ const CLIENT: &[(&str, &[&str])] = &[
     ("camera", &[]),
     ("surface", &[]),
     ("picture", &[]),
-    ("drawing", &["surface"]),
+    ("morph", &["surface"]),
+    ("drawing", &["morph", "surface"]),
     ("cache", &["surface"]),
     ("fetch", &[]),
     ("sight", &["camera"]),
-    ("cut", &["camera", "drawing", "sight", "surface"]),
-    ("terrain", &["cache", "camera", "cut", "drawing", "fetch", "sight", "surface"]),
-    ("render", &["camera", "drawing", "picture", "surface"]),
+    ("cut", &["camera", "drawing", "morph", "sight", "surface"]),
+    ("terrain", &["cache", "camera", "cut", "drawing", "fetch", "morph", "sight", "surface"]),
+    ("render", &["camera", "drawing", "morph", "picture", "surface"]),
     ("headless", &["camera", "fetch", "picture", "render", "terrain"]),
     ("viewer", &["camera", "fetch", "headless", "render", "terrain"]),
     ("web", &["viewer"]),
     // The made scene of the crate's own tests.
-    ("world", &["camera", "surface"]),
+    ("world", &["camera", "drawing", "surface"]),
 ];
 
 /// Lines that a file may have.

@@ -12,6 +12,10 @@
 //! Pure functions: no clock, no network, no memory from frame to frame. The order of refinement is that of
 //! Duchaineau et al., *ROAMing Terrain* (1997), the forced parents likewise.
 
+mod show;
+
+pub use show::{Showing, show, sight};
+
 use crate::camera::{Bounds, Camera, Plane, nearest_drawn};
 use crate::drawing::DrawItem;
 use crate::sight::{self, Sight};
@@ -149,8 +153,8 @@ pub struct Drawing {
     pub error_pixels: f64,
     /// The same, once all the wishes are there.
     pub error_pixels_goal: f64,
-    /// Diamonds drawn as split, in view or not.
-    pub splits: usize,
+    /// Diamonds drawn as split, in view or not: parents before children.
+    pub splits: Vec<Diamond>,
 }
 
 impl Ideal {
@@ -258,7 +262,7 @@ pub fn draw(
             whole &= node.diamond.level() > 0;
         }
         if node.parents.iter().all(|p| *p == NONE || drawn[*p as usize].is_some()) {
-            drawing.splits += usize::from(here.is_some());
+            drawing.splits.extend(here.as_ref().map(|_| node.diamond));
             drawn[*i as usize] = here;
         }
     }
@@ -276,6 +280,7 @@ pub fn draw(
                 diamond,
                 surface: Arc::clone(surface),
                 sides: sides.bits,
+                moving: None,
             });
         }
     }
@@ -632,7 +637,7 @@ mod tests {
                 assert!(!drawing.items.is_empty());
                 if known == 1.0 {
                     let drawn: Vec<_> = ideal.splits().filter(|d| surfaces.contains_key(d)).collect();
-                    assert_eq!(drawn.len(), drawing.splits);
+                    assert_eq!(drawn, drawing.splits);
                     assert_conforming(built, &drawn, &drawing.items);
                     assert!(drawing.error_pixels >= drawing.error_pixels_goal);
                 }

@@ -1,5 +1,6 @@
 //! What one frame draws, as plain data: the cut writes it, the renderer reads it.
 
+use crate::morph::{Moment, Motion};
 use crate::surface::Surface;
 use diamantina_protocol::diamond::Diamond;
 use std::sync::Arc;
@@ -16,4 +17,15 @@ pub struct DrawItem {
     /// Bit q: draw the triangle whose hypotenuse is side q of the diamond's local grid and whose apex is
     /// its centre.
     pub sides: u8,
+    /// How its points move, if they do.
+    pub moving: Option<Moving>,
+}
+
+/// A motion at a moment.
+#[derive(Debug, Clone)]
+pub struct Moving {
+    /// The motion.
+    pub motion: Arc<Motion>,
+    /// The moment to draw: the same for all items of a frame, or there are cracks.
+    pub now: Moment,
 }

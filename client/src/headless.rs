@@ -481,6 +481,8 @@ pub struct FrameLine {
     pub goal_pixels: f64,
     /// Whether all that the ideal cut wants is there.
     pub complete: bool,
+    /// Diamonds in motion.
+    pub moving: usize,
     /// Diamonds drawn.
     pub diamonds: usize,
     /// Triangles drawn.
@@ -511,13 +513,13 @@ pub struct FrameLine {
 
 impl FrameLine {
     /// The heading of the CSV.
-    pub const HEADING: &str = "frame,seconds,cut_ms,draw_ms,error_pixels,goal_pixels,complete,diamonds,triangles,draws,uploaded_bytes,gpu_bytes,resident,resident_bytes,bytes,requests,round_trips,real_points,fictitious_points,zone_in_effect";
+    pub const HEADING: &str = "frame,seconds,cut_ms,draw_ms,error_pixels,goal_pixels,complete,moving,diamonds,triangles,draws,uploaded_bytes,gpu_bytes,resident,resident_bytes,bytes,requests,round_trips,real_points,fictitious_points,zone_in_effect";
 
     /// The line, with the fields of the heading.
     #[must_use]
     pub fn csv(&self) -> String {
         format!(
-            "{},{:.4},{:.3},{:.3},{:.4},{:.4},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+            "{},{:.4},{:.3},{:.3},{:.4},{:.4},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
             self.frame,
             self.seconds,
             self.cut_ms,
@@ -525,6 +527,7 @@ impl FrameLine {
             self.error_pixels,
             self.goal_pixels,
             self.complete,
+            self.moving,
             self.diamonds,
             self.triangles,
             self.draws,
@@ -543,7 +546,8 @@ impl FrameLine {
 }
 
 /// Flies along a path while data stream in. Unless told to, no frame waits for them: each draws what is there. `each` sees
-/// every frame's line and picture as soon as it is drawn.
+/// every frame's line and picture as soon as it is drawn. Motions take the path's time, not the wall's: so a flight
+/// looks the same however long its frames take.
 ///
 /// # Errors
 /// When there is no graphics adapter, a picture cannot be written, or `each` says so.
@@ -564,14 +568,16 @@ pub fn fly(
             let due = Duration::from_secs_f64(f64::from(frame) / flight.frames_a_second);
             std::thread::sleep(due.saturating_sub(started.elapsed()));
         }
-        let camera = path.camera(f64::from(frame) / f64::from((flight.frames - 1).max(1)), flight.size);
+        let part = f64::from(frame) / f64::from((flight.frames - 1).max(1));
+        let camera = path.camera(part, flight.size);
         let clock = Instant::now();
         let drawn = stretched(&camera, look.exaggeration);
+        let seconds = part * path.seconds();
         if let Some(patience) = flight.patience {
-            terrain.settle(&drawn, patience);
+            terrain.settle_at(&drawn, seconds, patience);
         }
         let clock = flight.patience.map_or(clock, |_| Instant::now());
-        let view = terrain.frame(&drawn);
+        let view = terrain.frame_at(&drawn, seconds);
         let cut_ms = clock.elapsed().as_secs_f64() * 1e3;
         let clock = Instant::now();
         let stats = offscreen.draw(&layers, &drawn, &view.items, look)?;
@@ -585,6 +591,7 @@ pub fn fly(
             error_pixels: view.error_pixels,
             goal_pixels: view.error_pixels_goal,
             complete: view.complete,
+            moving: view.moving,
             diamonds: view.items.len(),
             triangles: stats.triangles,
             draws: stats.draws,
@@ -724,6 +731,7 @@ mod tests {
             error_pixels: f64::INFINITY,
             goal_pixels: 0.5,
             complete: false,
+            moving: 0,
             diamonds: 1,
             triangles: 2,
             draws: 3,

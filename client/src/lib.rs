@@ -8,6 +8,7 @@
 //! | [`fetch`] | requests by priority, retried, cancellable; answers as they stream in |
 //! | [`cache`] | decoded diamonds under a byte budget |
 //! | [`surface`] | a decoded diamond: heights and slopes |
+//! | [`morph`] | how what is drawn moves from one cut to the next |
 //! | [`terrain`] | one frame of streaming: cut, fetch, decode, cache |
 //! | [`drawing`] | what a frame draws, as plain data |
 //! | [`render`] | drawing + camera → pixels; the only module that knows the GPU |
@@ -20,6 +21,7 @@ pub mod cut;
 pub mod drawing;
 pub mod fetch;
 pub mod headless;
+pub mod morph;
 pub mod picture;
 pub mod render;
 pub mod sight;

@@ -4,6 +4,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use diamantina_client::camera::{Camera, FOV_Y};
 use diamantina_client::fetch::FetchError;
 use diamantina_client::headless::{self, Flight, FlightPath, FrameLine, PictureReport};
+use diamantina_client::morph;
 use diamantina_client::render::{self, Background, Colours, Look, Sun};
 use diamantina_client::sight::Sight;
 use diamantina_client::terrain::{self, Terrain, TerrainError};
@@ -142,6 +143,9 @@ struct FlyArgs {
     /// alone, and flights can be compared
     #[arg(long, value_name = "SECONDS")]
     settle: Option<f64>,
+    /// Seconds of the path that the surface takes to move whenever its level of detail changes, up to 60; 0: it jumps
+    #[arg(long, default_value_t = 0.0, value_name = "SECONDS")]
+    morph: f64,
     /// Write a line for each frame here (- for standard output)
     #[arg(long, value_name = "CSV")]
     csv: Option<PathBuf>,
@@ -234,7 +238,7 @@ fn main() -> ExitCode {
 }
 
 impl ViewArgs {
-    fn open(&self) -> Result<Terrain, Failure> {
+    fn open(&self, morph_seconds: f64) -> Result<Terrain, Failure> {
         if !(self.error_pixels.is_finite() && self.error_pixels > 0.0) {
             return Err(Failure(
                 2,
@@ -258,6 +262,7 @@ impl ViewArgs {
             tolerance_pixels: self.error_pixels,
             memory_bytes: self.memory << 20,
             sight: Sight { vertical: !self.sphere_error, foveation: self.foveation },
+            morph_seconds,
             encoding,
             zone: self.zone.clone(),
             ..terrain::Options::default()
@@ -297,7 +302,7 @@ impl ViewArgs {
 fn render(args: &RenderArgs) -> Result<(), Failure> {
     let patience = Duration::try_from_secs_f64(args.timeout)
         .map_err(|_| Failure(2, format!("--timeout {}: expected seconds, 0 or more", args.timeout)))?;
-    let mut terrain = args.view.open()?;
+    let mut terrain = args.view.open(0.0)?;
     let ViewArgs { size, exaggeration, .. } = args.view;
     let camera = match (args.eye, args.target) {
         (Some(eye), Some(target)) if eye == target => {
@@ -374,8 +379,12 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
     }
     let patience = args.settle.map(Duration::try_from_secs_f64).transpose();
     let patience = patience.map_err(|_| Failure(2, "--settle: expected seconds, 0 or more".to_owned()))?;
+    if !(0.0..=morph::SECONDS_MAX).contains(&args.morph) {
+        let max = morph::SECONDS_MAX;
+        return Err(Failure(2, format!("--morph {}: expected seconds from 0 to {max}", args.morph)));
+    }
     let path = args.path.as_deref().map(FlightPath::read).transpose()?;
-    let mut terrain = args.view.open()?;
+    let mut terrain = args.view.open(args.morph)?;
     let path = path.unwrap_or_else(|| FlightPath::round(terrain.scene()));
     let mut csv = args.csv.as_deref().map(headless::open_text).transpose()?;
     if let Some(out) = &mut csv {

@@ -16,6 +16,15 @@ use diamantina_protocol::diamond::{Block, Diamond, walk_shared};
 use diamantina_protocol::message::Layer;
 use diamantina_protocol::points::{self, DecodeError, Tally};
 
+/// The upward normal of a surface with a slope (metres up for a metre east, and for a metre north): its east and
+/// north, times 32767.
+#[must_use]
+pub fn normal([east, north]: [f32; 2]) -> [i16; 2] {
+    let length = (1.0 + east * east + north * north).sqrt();
+    // A float to integer cast saturates.
+    [east, north].map(|s| (-s / length * 32767.0).round() as i16)
+}
+
 /// The heights and slopes of a split diamond.
 ///
 /// Takes `12 ((n+1)^2 + n^2)` bytes: 100 kB for n = 64.

@@ -14,9 +14,10 @@
 
 use crate::cache::{Cache, Index, Key, PAGES_MAX};
 use crate::camera::{Camera, Plane};
-use crate::cut::{self, Ask, Ideal, Seen, Wish};
+use crate::cut::{self, Ask, Drawing, Ideal, Seen, Wish};
 use crate::drawing::DrawItem;
 use crate::fetch::{self, Event, FetchError, Fetcher, ROOT_BYTES, Traffic, Want};
+use crate::morph::{self, Change, Moment, Morphs};
 use crate::sight::Sight;
 use crate::surface::Surface;
 use bytes::Bytes;
@@ -62,6 +63,8 @@ pub struct Options {
     /// Memory for surfaces, in bytes. What the cut wants takes at most three quarters of it: where that is
     /// too little for the tolerance, the largest errors are reduced first.
     pub memory_bytes: usize,
+    /// Seconds that points take to move from one cut to the next, at most [`morph::SECONDS_MAX`]; 0: they jump.
+    pub morph_seconds: f64,
     /// How diamonds are encoded; only [`ENCODING`] so far.
     pub encoding: String,
     /// The name of a zone: while the eye is in it, less is asked for where nothing is seen from there.
@@ -77,6 +80,7 @@ impl Default for Options {
             exaggeration: 1.0,
             sight: Sight::default(),
             memory_bytes: 512 << 20,
+            morph_seconds: 0.0,
             encoding: ENCODING.to_owned(),
             zone: None,
             fetch: fetch::Options::default(),
@@ -123,6 +127,9 @@ pub enum TerrainError {
     /// Not a number of pixels.
     #[error("tolerance of {0} pixels: expected a number above 0")]
     Tolerance(f64),
+    /// Not a number of seconds.
+    #[error("motions of {0} seconds: expected a number from 0 to {max}", max = morph::SECONDS_MAX)]
+    Morph(f64),
     /// No threads.
     #[error(
         "cannot start a decoding thread: {0}: close other programs, or raise the limit on threads (ulimit -u)"
@@ -178,6 +185,9 @@ pub struct FrameView {
     pub error_pixels_goal: f64,
     /// Whether all that the ideal cut wants is there.
     pub complete: bool,
+    /// Diamonds in motion, or about to be: the next frame looks different, even if nothing arrives. The error counts
+    /// them as not yet split.
+    pub moving: usize,
     /// What has happened so far.
     pub stats: Stats,
 }
@@ -203,6 +213,8 @@ pub struct Terrain {
     problem: Option<String>,
     scene_changed: bool,
     opened: Instant,
+    /// What the last frame saw; nothing before the first.
+    planes: Option<[Plane; 5]>,
     stats: Stats,
     view: Option<ZoneView>,
 }
@@ -242,6 +254,7 @@ struct LayerState {
     ideal: Ideal,
     /// What the cut may take of the memory.
     memory_bytes: usize,
+    morphs: Morphs,
 }
 
 impl Terrain {
@@ -253,6 +266,9 @@ impl Terrain {
     pub fn open(url: &str, options: Options) -> Result<Self, TerrainError> {
         if options.tolerance_pixels.is_nan() || options.tolerance_pixels <= 0.0 {
             return Err(TerrainError::Tolerance(options.tolerance_pixels));
+        }
+        if !(0.0..=morph::SECONDS_MAX).contains(&options.morph_seconds) {
+            return Err(TerrainError::Morph(options.morph_seconds));
         }
         let opened = Instant::now();
         let (fetcher, scene) = Fetcher::open(url, options.fetch)?;
@@ -271,6 +287,7 @@ impl Terrain {
             index: Index::new(layer.forest),
             ideal: Ideal::default(),
             memory_bytes: share,
+            morphs: Morphs::new(options.morph_seconds),
         };
         let layers = scene.layers.iter().map(state).collect();
         let forests = scene.layers.iter().map(|layer| layer.forest).collect();
@@ -290,6 +307,7 @@ impl Terrain {
             problem: None,
             scene_changed: false,
             opened,
+            planes: None,
             stats: Stats::default(),
             view,
         })
@@ -361,8 +379,15 @@ impl Terrain {
 
     /// Takes in what has arrived, says what to draw, and asks for what is missing. The camera's heights are
     /// multiplied, if those of the terrain are. Never waits; takes about a microsecond for each diamond that
-    /// the cut looks at.
+    /// the cut looks at, and some 0.1 ms for each of up to [`morph::STARTS_MAX`] motions that begin.
     pub fn frame(&mut self, camera: &Camera) -> FrameView {
+        self.frame_at(camera, self.opened.elapsed().as_secs_f64())
+    }
+
+    /// As [`Terrain::frame`], at a moment of the caller's clock, which runs forward: seconds from any beginning, the same
+    /// for all frames. Only motions depend on it.
+    pub fn frame_at(&mut self, camera: &Camera, seconds: f64) -> FrameView {
+        let now = Moment::at(seconds);
         let started = Instant::now();
         self.take_decoded();
         let arrived = self.take_fetched();
@@ -385,9 +410,13 @@ impl Terrain {
                 memory_bytes: state.memory_bytes,
             };
             state.ideal = cut::choose(&ask, |d| state.index.get(d));
-            let drawing = cut::draw(number, &ask, &state.ideal, |d| self.cache.get((number, d)).cloned());
+            let surface = |d| self.cache.get((number, d)).cloned();
+            let mut drawing = cut::draw(number, &ask, &state.ideal, surface);
+            if state.morphs.is_on() {
+                view.moving += state.move_on(&ask, number, now, &surface, self.planes.as_ref(), &mut drawing);
+            }
             self.stats.splits_ideal += state.ideal.len();
-            self.stats.splits_drawn += drawing.splits;
+            self.stats.splits_drawn += drawing.splits.len();
             view.items.extend(drawing.items);
             view.error_pixels = view.error_pixels.max(drawing.error_pixels);
             view.error_pixels_goal = view.error_pixels_goal.max(drawing.error_pixels_goal);
@@ -395,6 +424,7 @@ impl Terrain {
             wishes.extend(drawing.wishes.into_iter().map(|wish| (number, wish)));
             state.index.trim(PAGES_MAX, state.ideal.seen());
         }
+        self.planes = Some(camera.planes());
         self.judge_streams(&arrived);
         let layers = self.layers.iter().enumerate();
         self.cache.want(layers.flat_map(|(number, state)| state.ideal.splits().map(move |d| (number, d))));
@@ -404,14 +434,27 @@ impl Terrain {
         view
     }
 
-    /// Repeats frames until all that the ideal cut wants is there, or nothing more can come, or the time
-    /// is up. For pictures without a window.
+    /// Repeats frames until all that the ideal cut wants is there and stands still, or nothing more can come, or the
+    /// time is up. For pictures without a window.
     pub fn settle(&mut self, camera: &Camera, timeout: Duration) -> FrameView {
+        self.wait(camera, None, timeout)
+    }
+
+    /// As [`Terrain::settle`], at one moment of the caller's clock: what moves does not come to rest meanwhile.
+    pub fn settle_at(&mut self, camera: &Camera, seconds: f64, timeout: Duration) -> FrameView {
+        self.wait(camera, Some(seconds), timeout)
+    }
+
+    fn wait(&mut self, camera: &Camera, seconds: Option<f64>, timeout: Duration) -> FrameView {
         let until = Instant::now() + timeout;
         loop {
-            let view = self.frame(camera);
+            let view = match seconds {
+                Some(seconds) => self.frame_at(camera, seconds),
+                None => self.frame(camera),
+            };
             let stuck = self.decoders.is_idle() && self.fetcher.is_stuck();
-            if view.complete || stuck || self.scene_changed || Instant::now() >= until {
+            let still = view.moving == 0 || seconds.is_some();
+            if (still && (view.complete || stuck)) || self.scene_changed || Instant::now() >= until {
                 return view;
             }
             std::thread::sleep(Duration::from_millis(2));
@@ -549,6 +592,37 @@ impl Terrain {
         self.stats.decoding = self.pending.len();
         self.stats.failed = self.failed.len();
         self.stats.frame_seconds = started.elapsed().as_secs_f64();
+    }
+}
+
+impl LayerState {
+    /// Goes on with the motions that lead to `drawing`, and puts what they look like `now` in its place. Returns how
+    /// many diamonds move.
+    fn move_on(
+        &mut self,
+        ask: &Ask,
+        number: usize,
+        now: Moment,
+        surface: &impl Fn(Diamond) -> Option<Arc<Surface>>,
+        last: Option<&[Plane; 5]>,
+        drawing: &mut Drawing,
+    ) -> usize {
+        // Nothing is drawn while a root is missing, and where nothing was drawn, nothing moves.
+        let wanted = if drawing.items.is_empty() { &[] } else { drawing.splits.as_slice() };
+        let entry = |d| self.index.get(d);
+        let sight = |d| match last {
+            Some(last) => cut::sight(ask, &self.ideal, d, entry(d), last),
+            None => morph::Sight { visible: false, error_metres: 0.0 },
+        };
+        let cut = self.morphs.step(&Change { layer: ask.layer, now, wanted, surface, sight: &sight });
+        let moving = cut.moving();
+        if moving > 0 {
+            let showing = cut::show(number, ask, &self.ideal, entry, &cut, now);
+            drawing.items = showing.items;
+            drawing.error_pixels = drawing.error_pixels.max(showing.error_pixels);
+            drawing.splits = cut.shown.iter().map(|shown| shown.diamond).collect();
+        }
+        moving
     }
 }
 
@@ -716,7 +790,7 @@ impl Bench {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::world::{Dice, Faults, Served, above, any_camera, world};
+    use crate::world::{Dice, Faults, Ground, Served, above, any_camera, world};
 
     const MINUTE: Duration = Duration::from_secs(60);
 
@@ -1001,6 +1075,105 @@ mod tests {
         terrain.set_tolerance_pixels(1.0);
         let view = terrain.settle(&above(), MINUTE);
         assert!(terrain.scene_changed() && !view.items.is_empty() && !view.complete);
+    }
+
+    /// Lattice points of the terrain, far from what has no data.
+    fn places() -> impl Iterator<Item = [i64; 2]> {
+        (20..470).step_by(5).flat_map(|y| (440..750).step_by(5).map(move |x| [x, y]))
+    }
+
+    /// Flies in and out again above resident data. The largest change of a height from one frame to the next, in
+    /// metres, and the number of frames in which something moved.
+    fn largest_step(morph_seconds: f64) -> (f64, usize) {
+        let served = Served::start(1, Faults::default());
+        let mut terrain = open(&served, Options { tolerance_pixels: 4.0, ..Options::default() });
+        let low = above().target + DVec3::new(0.0, -1500.0, 1800.0);
+        // In, a rest, and out.
+        let camera = |frame: i32| {
+            let part = (f64::from(frame) / 25.0).min(1.0).min(f64::from(75 - frame) / 25.0);
+            Camera { eye: above().eye.lerp(low, part), ..above() }
+        };
+        for frame in 0..=25 {
+            assert!(terrain.settle(&camera(frame), MINUTE).complete);
+        }
+        // All is there: the same frames, with motions and without.
+        terrain.layers[0].morphs = Morphs::new(morph_seconds);
+        terrain.planes = None;
+        let layer = terrain.scene.layers[0].clone();
+        let (mut last, mut most, mut moving) = (None::<Vec<f64>>, 0.0f64, 0);
+        for frame in 0..=75 {
+            let camera = camera(frame);
+            let view = terrain.frame_at(&camera, 1000.0 + f64::from(frame) / 60.0);
+            let planes = camera.planes();
+            moving += usize::from(view.moving > 0);
+            assert!(
+                view.complete && view.error_pixels.is_finite() && view.error_pixels >= view.error_pixels_goal
+            );
+            assert!(view.stats.frame_seconds < 0.1, "{}", view.stats.frame_seconds);
+            let mut ground = Ground::new(layer.forest, &view.items);
+            let heights: Vec<f64> = places()
+                .map(|p| {
+                    let [x, y] = layer.position(p.map(|i| u32::try_from(i).unwrap()));
+                    // Items out of view are left out.
+                    let sees =
+                        planes.iter().all(|s| s.normal.dot(DVec3::new(x, y, 300.0)) + s.offset > 400.0);
+                    if sees { ground.height(p).unwrap() * layer.quantum } else { f64::NAN }
+                })
+                .collect();
+            for (a, b) in last.iter().flatten().zip(&heights) {
+                most = most.max((a - b).abs());
+            }
+            last = Some(heights);
+        }
+        (most, moving)
+    }
+
+    #[test]
+    fn a_flight_with_motions_never_jumps() {
+        let (jump, none) = largest_step(0.0);
+        let (step, moving) = largest_step(0.3);
+        println!(
+            "{jump:.2} m at once, {step:.2} m in the largest step of motions, which {moving} frames had"
+        );
+        assert_eq!(none, 0);
+        // 18 frames a motion, one and a half times as fast in its middle: a twelfth.
+        assert!(jump > 1.0 && step < jump / 10.0 && moving > 40, "{jump} {step} {moving}");
+    }
+
+    #[test]
+    fn what_moves_is_told_counts_as_unsplit_and_is_waited_for() {
+        let served = Served::start(1, Faults::default());
+        let mut terrain =
+            open(&served, Options { morph_seconds: 0.5, tolerance_pixels: 8.0, ..Options::default() });
+        let view = terrain.settle(&above(), MINUTE);
+        assert!(view.complete && view.moving == 0 && view.error_pixels <= 8.0);
+        terrain.set_tolerance_pixels(2.0);
+        let (mut frames, mut last) = (0, view.error_pixels);
+        let until = Instant::now() + MINUTE;
+        let view = loop {
+            let view = terrain.frame(&above());
+            frames += usize::from(view.moving > 0);
+            if view.moving > 0 && view.complete {
+                assert!(view.error_pixels > 2.0, "{}", view.error_pixels);
+            }
+            last = last.max(view.error_pixels);
+            if (view.complete && view.moving == 0) || Instant::now() > until {
+                break view;
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        };
+        println!("{frames} frames with motions, largest error {last:.2} pixels");
+        assert!(frames > 5 && view.complete && view.error_pixels <= 2.0);
+        // What the last frame did not see has nothing to move from.
+        let away = Camera { target: above().eye + DVec3::Z, ..above() };
+        terrain.frame(&away);
+        terrain.set_tolerance_pixels(8.0);
+        let view = terrain.frame(&above());
+        assert_eq!((view.moving, view.complete), (0, true));
+        for morph_seconds in [-1.0, f64::NAN, 61.0] {
+            let options = Options { morph_seconds, ..Options::default() };
+            assert!(matches!(Terrain::open(&served.url, options), Err(TerrainError::Morph(_))));
+        }
     }
 
     #[test]

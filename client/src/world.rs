@@ -1,7 +1,8 @@
 //! A small scene made by code, and a server of it that can misbehave: for the tests of this crate.
 
 use crate::camera::{Camera, FOV_Y};
-use crate::surface::Surface;
+use crate::drawing::DrawItem;
+use crate::surface::{Surface, normal};
 use axum::Router;
 use axum::body::{Body, Bytes};
 use axum::extract::{Path, Query, RawQuery, State};
@@ -182,6 +183,79 @@ pub(crate) fn surfaces(built: &Built, wanted: impl Fn(Diamond) -> bool) -> HashM
         }
     }
     surfaces
+}
+
+/// What is drawn at the points of the lattice, motions included, in quanta.
+pub(crate) struct Ground {
+    forest: Forest,
+    heights: HashMap<[i64; 2], Option<f64>>,
+}
+
+impl Ground {
+    /// The ground of a frame's items of one layer. Asserts that patches give a point that they share the same height
+    /// and normal.
+    pub(crate) fn new(forest: Forest, items: &[DrawItem]) -> Self {
+        let mut points: HashMap<[i64; 2], (i32, u32, [i16; 2])> = HashMap::new();
+        for item in items {
+            let (local, block) = (forest.local(item.diamond), item.surface.block());
+            let n = block.segments();
+            for [p, q] in block.places() {
+                // In which triangles of the split the point lies.
+                let (x, y) = (p as i64 - n as i64, q as i64 - n as i64);
+                let sides = [-y >= x.abs(), x >= y.abs(), y >= x.abs(), -x >= y.abs()];
+                let count = if local.upper { 4 } else { 2 };
+                if !(0..count).any(|side| sides[side] && item.sides & (1 << side) != 0) {
+                    continue;
+                }
+                let slot = Block::slot(n, p, q);
+                let (height, slope) = (block.heights()[slot], item.surface.slopes()[slot]);
+                if height == NODATA {
+                    continue;
+                }
+                let drawn = match &item.moving {
+                    None => (height, 0.0f32.to_bits(), normal(slope)),
+                    Some(moving) => {
+                        let (record, duration) = (moving.motion.records()[slot], moving.motion.duration());
+                        let lift = record.lift(moving.now, duration);
+                        (height, lift.to_bits(), record.normal(moving.now, duration))
+                    }
+                };
+                let at = local.lattice2([p as i64, q as i64]);
+                let mut before = *points.entry(at).or_insert(drawn);
+                // Root squares know nothing of each other's heights: along their sides, their slopes differ.
+                if at.iter().any(|i| i % (1i64 << forest.root_log2()) == 0) {
+                    before.2 = drawn.2;
+                }
+                assert_eq!(before, drawn, "two patches draw {at:?}, one of them {:?}", item.diamond);
+            }
+        }
+        let height =
+            |(height, lift, _): (i32, u32, [i16; 2])| f64::from(height) + f64::from(f32::from_bits(lift));
+        let heights = points.into_iter().map(|(at, drawn)| (at, Some(height(drawn)))).collect();
+        Self { forest, heights }
+    }
+
+    /// The height drawn at a lattice point: that of a vertex, or between the two ends of the hypotenuse that it
+    /// halves; `None` where nothing is drawn.
+    pub(crate) fn height(&mut self, [x, y]: [i64; 2]) -> Option<f64> {
+        if let Some(height) = self.heights.get(&[x, y]) {
+            return *height;
+        }
+        let zeros = (x | y).trailing_zeros();
+        if zeros >= self.forest.root_log2() {
+            return None;
+        }
+        let h = 1i64 << zeros;
+        let ends = match ((x / h) % 2 == 1, (y / h) % 2 == 1) {
+            (true, true) if (x / (2 * h) + y / (2 * h)) % 2 == 0 => [[x - h, y - h], [x + h, y + h]],
+            (true, true) => [[x + h, y - h], [x - h, y + h]],
+            (true, false) => [[x - h, y], [x + h, y]],
+            _ => [[x, y - h], [x, y + h]],
+        };
+        let height = self.height(ends[0]).zip(self.height(ends[1])).map(|(a, b)| f64::midpoint(a, b));
+        self.heights.insert([x, y], height);
+        height
+    }
 }
 
 /// Numbers that look random, the same each time.

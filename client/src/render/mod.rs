@@ -8,7 +8,8 @@
 //! | `offscreen` | pictures without a window |
 //!
 //! A diamond is one or two draws: its points at their own buffer, its place and axes as an instance, the
-//! index lists shared by all. Nothing is used that WebGL2 lacks: no storage buffers, no base vertex, no
+//! index lists shared by all. One in motion has a second buffer, of the motions of its points, and a pipeline that
+//! reads it. Nothing is used that WebGL2 lacks: no storage buffers, no base vertex, no
 //! indirect draws. Depth is reversed and infinite, positions are relative to the eye.
 
 mod frame;
@@ -23,6 +24,7 @@ pub use offscreen::Offscreen;
 
 use crate::camera::{Camera, nearest_drawn};
 use crate::drawing::DrawItem;
+use crate::morph::Record;
 use diamantina_protocol::message::{Layer, Scene};
 use frame::{FrameUniform, LayerUniform, Reference, single};
 use glam::DVec3;
@@ -210,7 +212,10 @@ pub enum RenderError {
 struct Instance {
     origin: [i32; 2],
     axes: [i32; 4],
-    level: [i32; 2],
+    level: i32,
+    /// The moment to draw, and ticks that a motion takes; 0 and 1 where nothing moves.
+    now: i32,
+    duration: i32,
 }
 
 /// A draw: an item of the frame that is in view.
@@ -218,6 +223,7 @@ struct Draw<'a> {
     item: &'a DrawItem,
     sides: u8,
     shares_triangles: bool,
+    moves: bool,
     distance: f64,
 }
 
@@ -228,6 +234,7 @@ pub struct Renderer {
     options: Options,
     residents: Residents,
     terrain: wgpu::RenderPipeline,
+    terrain_morph: wgpu::RenderPipeline,
     sky: wgpu::RenderPipeline,
     frame_group: wgpu::BindGroup,
     frame_uniform: wgpu::Buffer,
@@ -277,12 +284,15 @@ impl Renderer {
             layout: &frame_layout,
             entries: &[wgpu::BindGroupEntry { binding: 0, resource: frame_uniform.as_entire_binding() }],
         });
-        let terrain = terrain_pipeline(&device, options, &[Some(&frame_layout), Some(&layer_layout)]);
+        let groups = [Some(&frame_layout), Some(&layer_layout)];
+        let [terrain, terrain_morph] =
+            [false, true].map(|morph| terrain_pipeline(&device, options, &groups, morph));
         let sky = sky_pipeline(&device, options, &[Some(&frame_layout)]);
         Self {
             residents: Residents::new(options.budget_bytes),
             options: *options,
             terrain,
+            terrain_morph,
             sky,
             frame_group,
             frame_uniform,
@@ -358,16 +368,18 @@ impl Renderer {
             .iter()
             .filter_map(|item| {
                 let resident = self.residents.get(item)?;
-                let bounds = resident.bounds.map(|b| b.stretched(exaggeration));
+                let layer = layers.get(item.layer)?;
+                let bounds = resident.bounds(layer.quantum).map(|b| b.stretched(exaggeration));
                 let bounds = bounds.filter(|b| b.touches(&planes))?;
-                let upper = layers.get(item.layer)?.forest.local(item.diamond).upper;
+                let upper = layer.forest.local(item.diamond).upper;
                 let sides = item.sides & if upper { 0b1111 } else { 0b0011 };
                 let distance = bounds.distance(camera.eye);
-                Some(Draw { item, sides, shares_triangles: resident.own.is_none(), distance })
+                let shares_triangles = resident.own.is_none();
+                Some(Draw { item, sides, shares_triangles, moves: resident.motion.is_some(), distance })
             })
             .collect();
         draws.sort_by(|a, b| {
-            let key = |d: &Draw<'_>| (d.item.layer, !d.shares_triangles);
+            let key = |d: &Draw<'_>| (d.item.layer, d.moves, !d.shares_triangles);
             key(a).cmp(&key(b)).then(a.distance.total_cmp(&b.distance))
         });
         draws
@@ -403,10 +415,14 @@ impl Renderer {
                 // Steps are at most a root square's side, 2^24.
                 let [ux, uy, vx, vy] = [local.u[0], local.u[1], local.v[0], local.v[1]]
                     .map(|step| i32::try_from(step).unwrap_or(0));
+                let moving = draw.item.moving.as_ref();
+                let (now, duration) = moving.map_or((0, 1), |m| (m.now.ticks(), m.motion.duration()));
                 Instance {
                     origin: references[layer].relative(local.origin),
                     axes: [ux, uy, vx, vy],
-                    level: [i32::try_from(draw.item.diamond.level()).unwrap_or(0), 0],
+                    level: i32::try_from(draw.item.diamond.level()).unwrap_or(0),
+                    now,
+                    duration,
                 }
             })
             .collect();
@@ -425,13 +441,17 @@ impl Renderer {
 
     fn draw_terrain(&self, pass: &mut wgpu::RenderPass<'_>, draws: &[Draw<'_>], stats: &mut FrameStats) {
         let (Some((_, layer_group)), Some(instances)) = (&self.layers, &self.instances) else { return };
-        pass.set_pipeline(&self.terrain);
         pass.set_bind_group(0, &self.frame_group, &[]);
         pass.set_vertex_buffer(2, instances.slice(..));
         let (mut layer_now, mut places_now, mut triangles_now) = (None, None, None::<&Triangles>);
+        let mut moves_now = None;
         for (draw, instance) in draws.iter().zip(0u32..) {
             let grid = self.residents.grid(draw.item);
             let (Some(grid), Some(resident)) = (grid, self.residents.get(draw.item)) else { continue };
+            if moves_now != Some(draw.moves) {
+                moves_now = Some(draw.moves);
+                pass.set_pipeline(if draw.moves { &self.terrain_morph } else { &self.terrain });
+            }
             if layer_now != Some(draw.item.layer) {
                 layer_now = Some(draw.item.layer);
                 let offset = u32::try_from(LAYER_STRIDE * draw.item.layer).unwrap_or(0);
@@ -447,6 +467,9 @@ impl Renderer {
                 pass.set_index_buffer(triangles.indices.slice(..), wgpu::IndexFormat::Uint16);
             }
             pass.set_vertex_buffer(1, resident.points.slice(..));
+            if let Some(motion) = &resident.motion {
+                pass.set_vertex_buffer(3, motion.records.slice(..));
+            }
             for range in runs(&triangles.sides, draw.sides) {
                 stats.draws += 1;
                 stats.triangles += u64::from((range.end - range.start) / 3);
@@ -557,30 +580,35 @@ fn layer_group(
     (buffer, group)
 }
 
+/// What the vertex shaders take of each buffer: see `shaders/terrain.wgsl`.
+const PLACE: &[wgpu::VertexAttribute] = &wgpu::vertex_attr_array![0 => Uint16x2];
+const POINT: &[wgpu::VertexAttribute] = &wgpu::vertex_attr_array![1 => Sint32, 2 => Snorm16x2];
+const INSTANCE: &[wgpu::VertexAttribute] =
+    &wgpu::vertex_attr_array![3 => Sint32x2, 4 => Sint32x4, 5 => Sint32x3];
+const RECORD: &[wgpu::VertexAttribute] =
+    &wgpu::vertex_attr_array![6 => Float32x2, 7 => Snorm16x2, 8 => Snorm16x2, 9 => Sint32];
+
+/// The pipeline of diamonds that stand still, or of those that move.
 fn terrain_pipeline(
     device: &wgpu::Device,
     options: &Options,
     groups: &[Option<&wgpu::BindGroupLayout>],
+    morph: bool,
 ) -> wgpu::RenderPipeline {
+    let layout = |stride: usize, step_mode, attributes| {
+        Some(wgpu::VertexBufferLayout { array_stride: stride as u64, step_mode, attributes })
+    };
+    let (vertex, instance) = (wgpu::VertexStepMode::Vertex, wgpu::VertexStepMode::Instance);
     let buffers = [
-        Some(wgpu::VertexBufferLayout {
-            array_stride: 4,
-            step_mode: wgpu::VertexStepMode::Vertex,
-            attributes: &wgpu::vertex_attr_array![0 => Uint16x2],
-        }),
-        Some(wgpu::VertexBufferLayout {
-            array_stride: size_of::<SurfacePoint>() as u64,
-            step_mode: wgpu::VertexStepMode::Vertex,
-            attributes: &wgpu::vertex_attr_array![1 => Sint32, 2 => Snorm16x2],
-        }),
-        Some(wgpu::VertexBufferLayout {
-            array_stride: size_of::<Instance>() as u64,
-            step_mode: wgpu::VertexStepMode::Instance,
-            attributes: &wgpu::vertex_attr_array![3 => Sint32x2, 4 => Sint32x4, 5 => Sint32x2],
-        }),
+        layout(4, vertex, PLACE),
+        layout(size_of::<SurfacePoint>(), vertex, POINT),
+        layout(size_of::<Instance>(), instance, INSTANCE),
+        layout(size_of::<Record>(), vertex, RECORD),
     ];
+    let (name, buffers) = if morph { ("terrain_morph", &buffers[..]) } else { ("terrain", &buffers[..3]) };
     // Both faces are drawn: terrain seen from below is terrain still.
-    pipeline(device, options, groups, "terrain", TERRAIN_WGSL, &buffers, wgpu::CompareFunction::Greater)
+    let entries = [&format!("{name}_vertex"), "terrain_fragment"];
+    pipeline(device, options, groups, entries, TERRAIN_WGSL, buffers, wgpu::CompareFunction::Greater)
 }
 
 fn sky_pipeline(
@@ -589,34 +617,35 @@ fn sky_pipeline(
     groups: &[Option<&wgpu::BindGroupLayout>],
 ) -> wgpu::RenderPipeline {
     // Infinitely far, so equal to the cleared depth and behind all else.
-    pipeline(device, options, groups, "sky", SKY_WGSL, &[], wgpu::CompareFunction::GreaterEqual)
+    let entries = ["sky_vertex", "sky_fragment"];
+    pipeline(device, options, groups, entries, SKY_WGSL, &[], wgpu::CompareFunction::GreaterEqual)
 }
 
-/// A pipeline with the entry points `NAME_vertex` and `NAME_fragment`.
+/// A pipeline with these entry points of a vertex and a fragment shader.
 fn pipeline(
     device: &wgpu::Device,
     options: &Options,
     groups: &[Option<&wgpu::BindGroupLayout>],
-    name: &str,
+    [vertex, fragment]: [&str; 2],
     source: &str,
     buffers: &[Option<wgpu::VertexBufferLayout<'_>>],
     depth_compare: wgpu::CompareFunction,
 ) -> wgpu::RenderPipeline {
     let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
-        label: Some(name),
+        label: Some(vertex),
         source: wgpu::ShaderSource::Wgsl(source.into()),
     });
     let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-        label: Some(name),
+        label: Some(vertex),
         bind_group_layouts: groups,
         immediate_size: 0,
     });
     device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
-        label: Some(name),
+        label: Some(vertex),
         layout: Some(&layout),
         vertex: wgpu::VertexState {
             module: &module,
-            entry_point: Some(&format!("{name}_vertex")),
+            entry_point: Some(vertex),
             compilation_options: wgpu::PipelineCompilationOptions::default(),
             buffers,
         },
@@ -631,7 +660,7 @@ fn pipeline(
         multisample: wgpu::MultisampleState { count: options.samples, ..Default::default() },
         fragment: Some(wgpu::FragmentState {
             module: &module,
-            entry_point: Some(&format!("{name}_fragment")),
+            entry_point: Some(fragment),
             compilation_options: wgpu::PipelineCompilationOptions::default(),
             targets: &[Some(wgpu::ColorTargetState {
                 format: options.format,

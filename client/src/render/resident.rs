@@ -1,12 +1,13 @@
 //! Surfaces on the GPU, under a budget of bytes.
 //!
-//! A surface takes 8 bytes a point (66 kB for n = 64) and, if it has nodata, its own index lists (up to
-//! 98 kB). Those that the present frame draws always stay; of the others, the longest unseen go first.
+//! A surface takes 8 bytes a point (66 kB for n = 64), if it has nodata, its own index lists (up to 98 kB), and, as
+//! long as it moves, 20 bytes a point (166 kB). Those that the present frame draws always stay; of the others, the longest unseen go first.
 
 use super::triangles::{self, Form, Lists};
 use crate::camera::Bounds;
 use crate::drawing::DrawItem;
-use crate::surface::Surface;
+use crate::morph::Motion;
+use crate::surface::{Surface, normal};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::message::Layer;
@@ -48,10 +49,21 @@ pub(super) struct Resident {
     pub(super) points: wgpu::Buffer,
     /// Its own index lists, if it has nodata.
     pub(super) own: Option<Triangles>,
-    /// The box around all its points; `None` if nothing is there to draw.
-    pub(super) bounds: Option<Bounds>,
+    /// The motion of its points in the last frame that drew it.
+    pub(super) motion: Option<MotionBuffer>,
+    /// The box around all its points where they stand still; `None` if nothing is there to draw.
+    bounds: Option<Bounds>,
     bytes: u64,
     last_frame: u64,
+}
+
+/// The motion of a surface on the GPU.
+pub(super) struct MotionBuffer {
+    /// Which motion it is, as with surfaces.
+    motion: Weak<Motion>,
+    /// A [`crate::morph::Record`] a slot.
+    pub(super) records: wgpu::Buffer,
+    span: f32,
 }
 
 type Key = (usize, Diamond);
@@ -100,9 +112,13 @@ impl Residents {
                 && std::ptr::eq(resident.surface.as_ptr(), Arc::as_ptr(&item.surface))
             {
                 resident.last_frame = self.frame;
+                let old_bytes = resident.bytes;
+                uploaded_bytes += resident.move_as(device, item);
+                self.bytes = self.bytes + resident.bytes - old_bytes;
                 continue;
             }
-            let resident = Resident::upload(device, layer, item, self.frame);
+            let mut resident = Resident::upload(device, layer, item, self.frame);
+            resident.move_as(device, item);
             uploaded_bytes += resident.bytes;
             self.bytes += resident.bytes;
             if let Some(old) = self.by_key.insert(key, resident) {
@@ -173,17 +189,43 @@ impl Resident {
         // Lone points make no triangles, and an empty buffer cannot be drawn from.
         let is_empty = own.as_ref().is_some_and(|t| t.indices.size() == 0);
         let bounds = if is_empty { None } else { bounds(layer, item.diamond, heights) };
-        Self { surface: Arc::downgrade(surface), points, own, bounds, bytes, last_frame: frame }
+        let surface = Arc::downgrade(surface);
+        Self { surface, points, own, motion: None, bounds, bytes, last_frame: frame }
+    }
+
+    /// Has the motion of the item and no other. Returns the bytes uploaded.
+    fn move_as(&mut self, device: &wgpu::Device, item: &DrawItem) -> u64 {
+        let wanted = item.moving.as_ref().map(|moving| &moving.motion);
+        let here = self.motion.as_ref().map(|buffer| buffer.motion.as_ptr());
+        if here == wanted.map(Arc::as_ptr) {
+            return 0;
+        }
+        self.bytes -= self.motion.take().map_or(0, |old| old.records.size());
+        let Some(motion) = wanted.filter(|m| m.records().len() == item.surface.slopes().len()) else {
+            return 0;
+        };
+        let records = device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+            label: Some("motion"),
+            contents: bytemuck::cast_slice(motion.records()),
+            usage: wgpu::BufferUsages::VERTEX,
+        });
+        let bytes = records.size();
+        self.bytes += bytes;
+        self.motion = Some(MotionBuffer { motion: Arc::downgrade(motion), records, span: motion.span() });
+        bytes
+    }
+
+    /// The box around all its points, wherever they are on their way; `None` if nothing is there to draw.
+    /// `quantum` in metres.
+    pub(super) fn bounds(&self, quantum: f64) -> Option<Bounds> {
+        let span = self.motion.as_ref().map_or(0.0, |motion| f64::from(motion.span) * quantum);
+        self.bounds.map(|b| Bounds { min: b.min - DVec3::Z * span, max: b.max + DVec3::Z * span })
     }
 }
 
 /// A point as the GPU has it. One without height gets 0: no triangle uses it.
-fn point(height: i32, [east, north]: [f32; 2]) -> SurfacePoint {
-    let length = (1.0 + east * east + north * north).sqrt();
-    #[allow(clippy::cast_possible_truncation, reason = "a float to integer cast saturates")]
-    let snorm = |x: f32| (x * 32767.0).round() as i16;
-    let height = if height == NODATA { 0 } else { height };
-    SurfacePoint { height, normal: [snorm(-east / length), snorm(-north / length)] }
+fn point(height: i32, slope: [f32; 2]) -> SurfacePoint {
+    SurfacePoint { height: if height == NODATA { 0 } else { height }, normal: normal(slope) }
 }
 
 fn bounds(layer: &Layer, diamond: Diamond, heights: &[i32]) -> Option<Bounds> {

@@ -7,10 +7,15 @@
     reason = "made-up numbers, small and positive"
 )]
 
+mod motion;
+
 use super::*;
 use crate::camera::FOV_Y;
+use crate::drawing::Moving;
+use crate::morph::{self, Change, Moment, Morphs, Sight};
 use crate::picture::{Picture, write_png};
 use crate::surface::Surface;
+use crate::world::{Dice, Ground};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::{Block, Diamond};
@@ -105,9 +110,16 @@ impl World {
             let sides = (0..4)
                 .filter(|side| !children[*side].is_some_and(|c| split.contains(&c)))
                 .fold(0u8, |sides, side| sides | 1 << side);
-            DrawItem { layer: 0, diamond: *d, surface: Arc::clone(&self.surfaces[d]), sides }
+            DrawItem { layer: 0, diamond: *d, surface: Arc::clone(&self.surfaces[d]), sides, moving: None }
         });
         items.filter(|item| item.sides != 0).collect()
+    }
+
+    /// Those of `split` in the order that a cut has.
+    fn sorted(split: &HashSet<Diamond>) -> Vec<Diamond> {
+        let mut sorted: Vec<_> = split.iter().copied().collect();
+        sorted.sort_unstable();
+        sorted
     }
 
     /// The cut that splits all diamonds above a level.

@@ -231,7 +231,9 @@ mod tests {
         });
         assert!(owned.contains(&[10, 10]) && owned.contains(&[20, 20]) && owned.contains(&[11, 15]));
         assert!(!owned.contains(&[15, 15]) && !owned.contains(&[9, 15]) && !owned.contains(&[22, 15]));
-        assert!(ground.holds(std::slice::from_ref(&rings)) && !ground.holds(&[vec![square(1095.0, 0.0, 10.0)]]));
+        assert!(
+            ground.holds(std::slice::from_ref(&rings)) && !ground.holds(&[vec![square(1095.0, 0.0, 10.0)]])
+        );
         let inner = (10..=20).flat_map(|x| (10..=20).map(move |y| [x, y]));
         let inner = inner.filter(|p| !p.iter().all(|w| (14..=16).contains(w)));
         let highest = inner.map(|p| ground.relief.at(p)).max().unwrap();

@@ -1,0 +1,100 @@
+//! What to draw of a cut that is in motion.
+//!
+//! While diamonds move, more are drawn as split than the index asks for, and some that it asks for are not yet: so
+//! the triangles and their error follow from the set of split diamonds, whatever chose it.
+
+use super::{Ask, Ideal, unknown};
+use crate::camera::Plane;
+use crate::drawing::{DrawItem, Moving};
+use crate::morph::{self, Moment, Sight};
+use diamantina_protocol::diamond::Diamond;
+use diamantina_protocol::index::Entry;
+use foldhash::fast::RandomState;
+use std::collections::HashSet;
+use std::sync::Arc;
+
+/// An error of fewer pixels than this comes and goes without a motion: nobody sees it.
+const STILL_PIXELS: f64 = 0.1;
+
+/// What is seen of a diamond that is drawn unsplit.
+#[derive(Debug, Clone, Copy)]
+struct Seen {
+    in_view: bool,
+    pixels: f64,
+}
+
+/// What is drawn of a cut in motion.
+#[derive(Debug, Default)]
+pub struct Showing {
+    /// The triangles to draw; those out of view are left out.
+    pub items: Vec<DrawItem>,
+    /// The largest error, in pixels, of what moves or waits: of diamonds that count as not yet split.
+    pub error_pixels: f64,
+}
+
+/// What [`morph::Change`] asks of a diamond, if the last frame saw what is within `last`.
+#[must_use]
+pub fn sight(ask: &Ask, ideal: &Ideal, d: Diamond, entry: Option<Entry>, last: &[Plane]) -> Sight {
+    let entry = entry.unwrap_or_else(|| unknown(ask.layer));
+    let Seen { in_view, pixels } = seen(ask, ideal, d, Some(entry));
+    let visible = in_view && pixels >= STILL_PIXELS && ask.bounds(d, &entry).touches(last);
+    Sight { visible, error_metres: entry.error_metres }
+}
+
+/// The triangles of a cut in motion at a moment, and its error. `entry` looks a diamond up in the index.
+#[must_use]
+pub fn show(
+    number: usize,
+    ask: &Ask,
+    ideal: &Ideal,
+    entry: impl Fn(Diamond) -> Option<Entry>,
+    cut: &morph::Cut,
+    now: Moment,
+) -> Showing {
+    let forest = &ask.layer.forest;
+    let seen = |d: Diamond| seen(ask, ideal, d, entry(d));
+    let split: HashSet<Diamond, RandomState> = cut.shown.iter().map(|shown| shown.diamond).collect();
+    let mut showing = Showing::default();
+    for shown in &cut.shown {
+        let d = shown.diamond;
+        if let Some(motion) = shown.motion.as_ref().filter(|_| seen(d).in_view) {
+            let entry = entry(d).unwrap_or_else(|| unknown(ask.layer));
+            let pixels = ask.pixels(d, d.level(), motion.error_metres(), &ask.bounds(d, &entry));
+            showing.error_pixels = showing.error_pixels.max(pixels);
+        }
+        let mut sides = 0;
+        if d.level() + 1 == forest.levels() {
+            // The finest triangles belong to no child.
+            let all = if forest.local(d).upper { 0b1111 } else { 0b11 };
+            sides = if seen(d).in_view { all } else { 0 };
+        }
+        for (side, child) in forest.children(d).into_iter().enumerate() {
+            let open = child.filter(|child| !split.contains(child) && seen(*child).in_view);
+            sides |= u8::from(open.is_some()) << side;
+        }
+        if sides != 0 {
+            let moving = shown.motion.clone().map(|motion| Moving { motion, now });
+            let surface = Arc::clone(&shown.surface);
+            showing.items.push(DrawItem { layer: number, diamond: d, surface, sides, moving });
+        }
+    }
+    for d in &cut.waiting {
+        showing.error_pixels = showing.error_pixels.max(seen(*d).pixels);
+    }
+    showing
+}
+
+/// As the cut saw it, if it looked at the diamond.
+fn seen(ask: &Ask, ideal: &Ideal, d: Diamond, entry: Option<Entry>) -> Seen {
+    if let Some(number) = ideal.numbers.get(&d) {
+        let node = ideal.node(*number);
+        return Seen { in_view: node.in_view && !node.entry.is_empty(), pixels: node.pixels };
+    }
+    let entry = entry.unwrap_or_else(|| unknown(ask.layer));
+    let bounds = ask.bounds(d, &entry);
+    let in_view = !entry.is_empty() && bounds.touches(&ask.camera.planes());
+    Seen {
+        in_view,
+        pixels: if in_view { ask.pixels(d, d.level(), entry.error_metres, &bounds) } else { 0.0 },
+    }
+}

@@ -1,0 +1,562 @@
+//! Motions: from one cut to the next, what is drawn moves and does not jump.
+//!
+//! A diamond that begins to be drawn as split starts from the surface that its parents drew and reaches its own
+//! heights after a set time; one that nothing wants split any more goes back the same way, and only then is it
+//! merged. After Hoppe's geomorphs (*Smooth View-Dependent Level-of-Detail Control*, 1998).
+//!
+//! **Exact where diamonds meet.** The drawn height of a point is a function of the point alone, whichever patch
+//! draws it: its height and a [`Record`] of where it comes from, where it goes to and since when. A split changes
+//! only points strictly inside, so each point has one last change, in one diamond, which alone writes its
+//! record; the diamonds within that diamond have their parents' records on their borders, as they have their parents'
+//! heights. A diamond merges only after all within it are merged, so no record ever changes behind a copy.
+//!
+//! **From what is drawn.** A record starts where its point is at that moment: an old point where its parents draw
+//! it, a new one in the middle of the hypotenuse that it halves. So a diamond need not wait for its parents'
+//! motions, and turns round half way without a jump.
+//!
+//! ```text
+//!   height                  __ own        A growing diamond: from `from` to 0 above its own heights.
+//!      |                 ,-'              A merging one: from 0, or where it is, to where its parents'
+//!      |              ,-'                 surface is; then it is held there until that stands still, and
+//!      |  parents' _-'                    is gone.
+//!      +-----------start-----end---- time
+//! ```
+//!
+//! No clock is read here: moments come from outside, so a flight can be repeated.
+
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_precision_loss,
+    reason = "local coordinates are at most 256, heights below 2^24 and motions shorter than 2^24 ticks"
+)]
+
+use crate::surface::{Surface, normal};
+use diamantina_protocol::NODATA;
+use diamantina_protocol::bintree::Forest;
+use diamantina_protocol::diamond::{Block, Diamond, walk_shared};
+use diamantina_protocol::message::Layer;
+use foldhash::fast::RandomState;
+use std::cmp::Reverse;
+use std::collections::{HashMap, HashSet};
+use std::sync::Arc;
+
+/// Ticks of a second: 61 microseconds each, so that moments wrap around after 36 hours.
+pub const TICKS_A_SECOND: f64 = 16_384.0;
+
+/// The longest motion, in seconds: fewer than 2^24 ticks, which `f32` counts exactly.
+pub const SECONDS_MAX: f64 = 60.0;
+
+/// Diamonds of a layer in motion at a time; others wait for theirs to begin. Of n = 64 they take 85 MB here,
+/// and as much on the GPU.
+pub const MOTIONS_MAX: usize = 512;
+
+/// Motions that begin in one frame, for each layer; some 0.1 ms each. The others begin in the next one.
+pub const STARTS_MAX: usize = 64;
+
+/// A moment, in ticks from a beginning that all moments of a scene share. Wraps around.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Moment(i32);
+
+impl Moment {
+    /// The moment `seconds` after the beginning.
+    #[must_use]
+    pub fn at(seconds: f64) -> Self {
+        // Wraps around on purpose: only differences count.
+        Self((seconds * TICKS_A_SECOND) as i64 as i32)
+    }
+
+    /// The number of ticks, as the GPU takes it.
+    #[must_use]
+    pub fn ticks(self) -> i32 {
+        self.0
+    }
+
+    /// Ticks from `earlier` to this moment; negative if that is the later one.
+    #[must_use]
+    pub fn since(self, earlier: Self) -> i32 {
+        self.0.wrapping_sub(earlier.0)
+    }
+}
+
+/// The motion of a point: how far above its own height it is drawn, in quanta, and with which normal (east and
+/// north, as [`normal`] gives them). 20 bytes, as the GPU takes them.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct Record {
+    from: f32,
+    to: f32,
+    from_normal: [i16; 2],
+    to_normal: [i16; 2],
+    start: i32,
+}
+
+impl Record {
+    /// Of a point that does not move.
+    #[must_use]
+    fn still(normal: [i16; 2]) -> Self {
+        Self { from: 0.0, to: 0.0, from_normal: normal, to_normal: normal, start: 0 }
+    }
+
+    fn moves(&self) -> bool {
+        self.from != self.to || self.from_normal != self.to_normal
+    }
+
+    /// How much of the way is done: 0 at the start and before, 1 at the end, with no speed at either.
+    fn weight(&self, now: Moment, duration: i32) -> f32 {
+        let t = (now.since(Moment(self.start)) as f32 / duration as f32).clamp(0.0, 1.0);
+        t * t * (3.0 - 2.0 * t)
+    }
+
+    /// How far above its own height the point is drawn, in quanta. The twin of the vertex shader's.
+    #[must_use]
+    pub fn lift(&self, now: Moment, duration: i32) -> f32 {
+        if now.since(Moment(self.start)) >= duration {
+            return self.to;
+        }
+        self.from + (self.to - self.from) * self.weight(now, duration)
+    }
+
+    /// The normal that it is drawn with.
+    #[must_use]
+    pub fn normal(&self, now: Moment, duration: i32) -> [i16; 2] {
+        let weight = self.weight(now, duration);
+        [0, 1].map(|i| {
+            let [from, to] = [self.from_normal[i], self.to_normal[i]].map(f32::from);
+            (from + (to - from) * weight).round() as i16
+        })
+    }
+}
+
+/// The motion of a split diamond's points.
+///
+/// Takes `20 ((n+1)^2 + n^2)` bytes: 166 kB for n = 64.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Motion {
+    records: Vec<Record>,
+    duration: i32,
+    end: Moment,
+    merging: bool,
+    span: f32,
+    error_metres: f32,
+}
+
+impl Motion {
+    /// A record for each slot of the block.
+    #[must_use]
+    pub fn records(&self) -> &[Record] {
+        &self.records
+    }
+
+    /// Ticks from the start of each record to its end; above 0.
+    #[must_use]
+    pub fn duration(&self) -> i32 {
+        self.duration
+    }
+
+    /// The most that a point is above or below its own height, or moves, at any time, in quanta.
+    #[must_use]
+    pub fn span(&self) -> f32 {
+        self.span
+    }
+
+    /// An upper bound, in metres, on the vertical distance from what is drawn to the source samples. Points that
+    /// move together blend two surfaces, and stay within the larger of both errors; where a border goes on
+    /// moving with the parents', the error is larger by that motion.
+    #[must_use]
+    pub fn error_metres(&self) -> f32 {
+        self.error_metres
+    }
+
+    fn is_over(&self, now: Moment) -> bool {
+        now.since(self.end) >= 0
+    }
+}
+
+/// What is to be known of a diamond that would begin to move.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sight {
+    /// Whether anyone would see it jump: it is in view, was so a frame ago, and not too small.
+    pub visible: bool,
+    /// Its error where it is not split, in metres, as declared.
+    pub error_metres: f32,
+}
+
+/// A change from the cut of the last frame to this one's.
+pub struct Change<'a> {
+    /// The layer.
+    pub layer: &'a Layer,
+    /// The moment of this frame, not before the last one's.
+    pub now: Moment,
+    /// The diamonds that should be drawn as split, parents before children, each with its parents.
+    pub wanted: &'a [Diamond],
+    /// The surfaces that are resident, those of `wanted` among them.
+    pub surface: &'a dyn Fn(Diamond) -> Option<Arc<Surface>>,
+    /// What is seen of a diamond.
+    pub sight: &'a dyn Fn(Diamond) -> Sight,
+}
+
+/// A diamond that is drawn as split.
+#[derive(Debug, Clone)]
+pub struct Shown {
+    /// The diamond.
+    pub diamond: Diamond,
+    /// Its surface.
+    pub surface: Arc<Surface>,
+    /// The motion of its points, if some move.
+    pub motion: Option<Arc<Motion>>,
+}
+
+/// What is drawn as split while it moves.
+#[derive(Debug, Clone, Default)]
+pub struct Cut {
+    /// Each with its parents, and parents before children.
+    pub shown: Vec<Shown>,
+    /// Wanted diamonds whose turn comes later: they are drawn unsplit.
+    pub waiting: Vec<Diamond>,
+    /// How many diamonds merge, or wait for those within them.
+    pub held: usize,
+}
+
+impl Cut {
+    /// Diamonds that move, or are about to.
+    #[must_use]
+    pub fn moving(&self) -> usize {
+        self.shown.iter().filter(|s| s.motion.is_some()).count() + self.waiting.len() + self.held
+    }
+}
+
+/// The motions of a layer, from frame to frame. Bounded by the cut and [`MOTIONS_MAX`].
+#[derive(Debug, Default)]
+pub struct Morphs {
+    duration: i32,
+    /// What the last frame drew as split.
+    last: HashSet<Diamond, RandomState>,
+    /// Those of diamonds with a point that moves.
+    motions: HashMap<Diamond, Arc<Motion>, RandomState>,
+}
+
+type Set = HashSet<Diamond, RandomState>;
+
+impl Morphs {
+    /// Motions that take `seconds`, at most [`SECONDS_MAX`]; with 0 there are none.
+    #[must_use]
+    pub fn new(seconds: f64) -> Self {
+        Self { duration: (seconds.min(SECONDS_MAX) * TICKS_A_SECOND) as i32, ..Self::default() }
+    }
+
+    /// Whether anything ever moves.
+    #[must_use]
+    pub fn is_on(&self) -> bool {
+        self.duration > 0
+    }
+
+    /// Goes on to the next frame: what it draws as split. Costs some 0.1 ms for each motion that begins.
+    pub fn step(&mut self, change: &Change) -> Cut {
+        let forest = change.layer.forest;
+        self.motions.retain(|_, motion| motion.merging || !motion.is_over(change.now));
+        let mut starts = 0;
+        let (mut order, mut waiting) = (Vec::with_capacity(change.wanted.len()), Vec::new());
+        let mut set = Set::default();
+        for d in change.wanted.iter().copied() {
+            // Those within one that waits are wanted again once it is split.
+            if !forest.parents(d).all(|parent| set.contains(&parent)) {
+                continue;
+            }
+            if self.grow(change, d, &mut starts) {
+                set.insert(d);
+                order.push(d);
+            } else {
+                waiting.push(d);
+            }
+        }
+        let held = self.hold(change, &mut set, &mut starts);
+        order.extend(held.iter().copied());
+        self.motions.retain(|d, _| set.contains(d));
+        let shown = order.into_iter().filter_map(|diamond| {
+            let motion = self.motions.get(&diamond).cloned();
+            Some(Shown { diamond, surface: (change.surface)(diamond)?, motion })
+        });
+        let cut = Cut { shown: shown.collect(), waiting, held: held.len() };
+        self.last = set;
+        cut
+    }
+
+    /// Begins or turns the motion of a wanted diamond whose parents are drawn as split, where there is something
+    /// to see. Whether it can be drawn as split now.
+    fn grow(&mut self, change: &Change, d: Diamond, starts: &mut usize) -> bool {
+        let way = if self.last.contains(&d) {
+            if !self.motions.get(&d).is_some_and(|motion| motion.merging) {
+                return true;
+            }
+            Way::Back
+        } else {
+            let visible = d.level() > 0 && (change.sight)(d).visible;
+            let parents_move = change.layer.forest.parents(d).any(|p| self.motions.contains_key(&p));
+            match (visible, parents_move) {
+                (true, _) => Way::Out,
+                // Its border moves with theirs.
+                (false, true) => Way::Along,
+                (false, false) => return true,
+            }
+        };
+        self.start(change, d, way, starts)
+    }
+
+    /// What the last frame drew and nothing wants any more is held while it moves back, finest first; parents
+    /// before children.
+    fn hold(&mut self, change: &Change, set: &mut Set, starts: &mut usize) -> Vec<Diamond> {
+        let forest = change.layer.forest;
+        let mut lost: Vec<Diamond> = self.last.iter().copied().filter(|d| !set.contains(d)).collect();
+        lost.sort_unstable_by_key(|d| (Reverse(d.level()), *d));
+        let mut held = Vec::new();
+        for d in lost {
+            let is_whole = !forest.children(d).iter().flatten().any(|child| set.contains(child));
+            if is_whole && !self.merge(change, d, starts) {
+                continue;
+            }
+            set.insert(d);
+            held.push(d);
+        }
+        held.reverse();
+        // What is resident has its parents resident, so this drops nothing, as long as that holds.
+        held.retain(|d| {
+            let stays = (change.surface)(*d).is_some() && forest.parents(*d).all(|p| set.contains(&p));
+            if !stays {
+                set.remove(d);
+            }
+            stays
+        });
+        held
+    }
+
+    /// Moves an unwanted diamond back, in which no other is split. Whether it stays drawn as split.
+    fn merge(&mut self, change: &Change, d: Diamond, starts: &mut usize) -> bool {
+        if d.level() == 0 || (change.surface)(d).is_none() || !(change.sight)(d).visible {
+            return false;
+        }
+        match self.motions.get(&d) {
+            Some(motion) if motion.merging => {
+                // It is where its parents will be in the end, which are to be there, too.
+                let mut parents = change.layer.forest.parents(d);
+                !motion.is_over(change.now) || parents.any(|p| self.motions.contains_key(&p))
+            }
+            _ => {
+                // Until its turn comes, it stays as it is.
+                self.start(change, d, Way::Home, starts);
+                true
+            }
+        }
+    }
+
+    fn start(&mut self, change: &Change, d: Diamond, way: Way, starts: &mut usize) -> bool {
+        let is_full = self.motions.len() >= MOTIONS_MAX && !self.motions.contains_key(&d);
+        if *starts >= STARTS_MAX || is_full {
+            return false;
+        }
+        let Some(surface) = (change.surface)(d) else { return false };
+        let parents = change.layer.forest.parents(d);
+        let parent = |p: Diamond| {
+            let motion = self.motions.get(&p).map(Arc::as_ref);
+            Some(Parent { diamond: p, surface: (change.surface)(p)?, motion })
+        };
+        let Some(parents) = parents.map(parent).collect::<Option<Vec<_>>>() else { return false };
+        let start = Start {
+            forest: &change.layer.forest,
+            d,
+            surface: &surface,
+            parents: &parents,
+            own: self.motions.get(&d).map(Arc::as_ref),
+            now: change.now,
+            duration: self.duration,
+        };
+        let declared = (change.sight)(d).error_metres;
+        let motion = start.motion(way, declared, change.layer.quantum);
+        *starts += 1;
+        if way != Way::Home && !motion.records.iter().any(Record::moves) {
+            self.motions.remove(&d);
+            return true;
+        }
+        self.motions.insert(d, Arc::new(motion));
+        true
+    }
+}
+
+/// Where a motion leads.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Way {
+    /// From the parents' surface to its own.
+    Out,
+    /// From where it is to its own surface.
+    Back,
+    /// From where it is to the parents' surface.
+    Home,
+    /// It is there already: only the border moves, with the parents.
+    Along,
+}
+
+/// All that the motion of a diamond starts from.
+struct Start<'a> {
+    forest: &'a Forest,
+    d: Diamond,
+    surface: &'a Surface,
+    parents: &'a [Parent<'a>],
+    own: Option<&'a Motion>,
+    now: Moment,
+    duration: i32,
+}
+
+/// A diamond that gives a triangle to the one that starts.
+struct Parent<'a> {
+    diamond: Diamond,
+    surface: Arc<Surface>,
+    motion: Option<&'a Motion>,
+}
+
+/// A point as the parents have it.
+#[derive(Clone, Copy)]
+struct Before {
+    height: i32,
+    slope: [f32; 2],
+    record: Option<Record>,
+}
+
+/// Where a point is, or will be: quanta above its own height, and its normal.
+type Place = (f32, [i16; 2]);
+
+impl Start<'_> {
+    fn motion(&self, way: Way, declared_metres: f32, quantum: f64) -> Motion {
+        let (heights, slopes) = (self.surface.block().heights(), self.surface.slopes());
+        let before = self.before();
+        let mut records: Vec<Record> = slopes.iter().map(|slope| Record::still(normal(*slope))).collect();
+        let (n, upper) = (self.surface.block().segments(), self.forest.local(self.d).upper);
+        let mut end = self.now;
+        for [p, q] in self.surface.block().places() {
+            let slot = Block::slot(n, p, q);
+            if heights[slot] == NODATA || (!upper && q > p) {
+                continue;
+            }
+            if p == 0 || q == 0 || p == 2 * n || q == 2 * n {
+                // Records that are over say nothing any more.
+                let over = |r: &Record| self.now.since(Moment(r.start)) >= self.duration;
+                let Some(record) = before[slot].record.filter(|r| !over(r)) else { continue };
+                let until = Moment(record.start.wrapping_add(self.duration));
+                if until.since(end) > 0 && record.moves() {
+                    end = until;
+                }
+                records[slot] = record;
+                continue;
+            }
+            let own = (0.0, records[slot].to_normal);
+            let here = || self.own.map_or(own, |motion| self.drawn(&motion.records[slot]));
+            let (from, to) = match way {
+                Way::Out => (self.parents_place(&before, [p, q], true), Some(own)),
+                Way::Back => (Some(here()), Some(own)),
+                Way::Home => (Some(here()), self.parents_place(&before, [p, q], false)),
+                Way::Along => continue,
+            };
+            let (Some(from), Some(to)) = (from, to) else { continue };
+            records[slot] =
+                Record { from: from.0, to: to.0, from_normal: from.1, to_normal: to.1, start: self.now.0 };
+        }
+        if way != Way::Along {
+            end = Moment(self.now.0.wrapping_add(self.duration));
+        }
+        let far = |r: &Record| r.from.abs().max(r.to.abs()).max((r.to - r.from).abs());
+        let span = records.iter().map(far).fold(0.0, f32::max);
+        // What the parents' motions add, here and while they go on.
+        let moving = || self.parents.iter().filter_map(|parent| parent.motion);
+        let errors = moving().chain(self.own).map(|motion| motion.error_metres);
+        let shift = moving().map(|motion| motion.span).fold(0.0, f32::max);
+        let error_metres = errors.fold(declared_metres, f32::max) + shift * quantum as f32;
+        let merging = way == Way::Home;
+        Motion { records, duration: self.duration, end, merging, span, error_metres }
+    }
+
+    /// What the parents have of each slot.
+    fn before(&self) -> Vec<Before> {
+        let nothing = Before { height: NODATA, slope: [0.0; 2], record: None };
+        let mut before = vec![nothing; self.surface.block().heights().len()];
+        for parent in self.parents {
+            let (heights, slopes) = (parent.surface.block().heights(), parent.surface.slopes());
+            walk_shared(self.forest, self.d, parent.diamond, |to, from| {
+                let record = parent.motion.map(|motion| motion.records[from]);
+                before[to] = Before { height: heights[from], slope: slopes[from], record };
+            });
+        }
+        before
+    }
+
+    fn drawn(&self, record: &Record) -> Place {
+        (record.lift(self.now, self.duration), record.normal(self.now, self.duration))
+    }
+
+    /// Where the parents' surface is at a point strictly inside: as they draw it at this moment, or as it will be in
+    /// the end. `None` where they have nothing.
+    fn parents_place(&self, before: &[Before], [p, q]: [usize; 2], at_once: bool) -> Option<Place> {
+        let n = self.surface.block().segments();
+        let own = self.surface.block().heights()[Block::slot(n, p, q)];
+        let place = |slot: usize| -> Option<Place> {
+            let Before { height, slope, record } = before[slot];
+            if height == NODATA {
+                return None;
+            }
+            let above = (height - own) as f32;
+            match record.filter(|_| at_once).map(|record| self.drawn(&record)) {
+                Some((lift, normal)) => Some((above + lift, normal)),
+                None => Some((above, normal(slope))),
+            }
+        };
+        if p.is_multiple_of(2) || !self.forest.adds_points(self.d.level()) {
+            return place(Block::slot(n, p, q));
+        }
+        // A new point halves a hypotenuse: the diagonals of cells alternate, as the bintree's do.
+        let (u, v) = (p / 2, q / 2);
+        let ends = if (u + v).is_multiple_of(2) { [[0, 0], [1, 1]] } else { [[1, 0], [0, 1]] };
+        let [a, b] = ends.map(|[du, dv]| place(Block::slot(n, 2 * (u + du), 2 * (v + dv))));
+        let (a, b) = (a?, b?);
+        let middle = [0, 1].map(|i| i16::midpoint(a.1[i], b.1[i]));
+        Some((f32::midpoint(a.0, b.0), middle))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::world::Dice;
+
+    #[test]
+    fn a_motion_begins_and_ends_where_it_should_and_stays_between() {
+        let mut dice = Dice(1);
+        for _ in 0..2000 {
+            let mut roll = || ((dice.roll() - 0.5) * 1e4) as f32;
+            let start = (f64::from(roll()) * 2e5) as i32;
+            let duration = 2 + (f64::from(roll()).abs() * 100.0) as i32;
+            let (from, to) = (roll(), roll());
+            let record = Record { from, to, from_normal: [-32767, 5], to_normal: [300, 32767], start };
+            let at = |age: i32| record.lift(Moment(start.wrapping_add(age)), duration);
+            assert_eq!((at(-5), at(0), at(duration), at(i32::MAX)), (from, from, to, to));
+            let (mut last, steps) = (from, duration.min(50));
+            for step in 1..=steps {
+                let age = (i64::from(duration) * i64::from(step) / i64::from(steps)) as i32;
+                let here = at(age);
+                let [low, high] = [from.min(to), from.max(to)];
+                assert!((low - 0.01..=high + 0.01).contains(&here), "{record:?} {here}");
+                // The steepest that a smooth step is, and a step of ticks.
+                let part = 1.0 / steps as f32 + 1.0 / duration as f32;
+                assert!((here - last).abs() <= 1.51 * part * (to - from).abs() + 0.01, "{record:?} {age}");
+                last = here;
+            }
+            let normal = |age: i32| record.normal(Moment(start.wrapping_add(age)), duration);
+            assert_eq!((normal(0), normal(duration)), (record.from_normal, record.to_normal));
+        }
+    }
+
+    #[test]
+    fn moments_wrap_around_and_their_differences_do_not() {
+        let week = 7.0 * 86_400.0;
+        for seconds in [0.0, 131_071.9, 131_072.0, week] {
+            let (a, b) = (Moment::at(seconds), Moment::at(seconds + 0.5));
+            assert_eq!((b.since(a), a.since(b)), (8192, -8192), "{seconds}");
+        }
+    }
+}
