@@ -6,6 +6,7 @@ use crate::truth::{Check, Samples, Verdict};
 use crate::world::{Dice, Faults, Proxy, World, build, options, programs, write_raw};
 use diamantina_client::camera::Camera;
 use diamantina_client::cut::{self, Ask};
+use diamantina_client::sight::Sight;
 use diamantina_client::terrain::{self, Terrain};
 use diamantina_client::{fetch, headless};
 use diamantina_protocol::NODATA;
@@ -267,6 +268,8 @@ fn every_prefix_covers_the_forest_once_without_cracks() {
         camera: &camera,
         exaggeration: 1.0,
         tolerance_pixels: 1e-9,
+        sight: Sight::default(),
+        seen: None,
         memory_bytes: usize::MAX,
     };
     let ideal = cut::choose(&ask, |d| Some(entries[&d]));
