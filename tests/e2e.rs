@@ -33,3 +33,5 @@ mod tidy;
 mod truth;
 /// The harness: synthetic DEM → store → server on a free port → client, and a network that misbehaves.
 mod world;
+/// Zones: computed, published, served; cheaper pictures from within, and the same skyline.
+mod zone;
