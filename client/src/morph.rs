@@ -50,7 +50,7 @@ pub const SECONDS_MAX: f64 = 60.0;
 /// and as much on the GPU.
 pub const MOTIONS_MAX: usize = 512;
 
-/// Motions that begin in one frame, for each layer; some 0.1 ms each. The others begin in the next one.
+/// Motions that begin in one frame, for each layer; up to half a millisecond each. The others begin in the next one.
 pub const STARTS_MAX: usize = 64;
 
 /// A moment, in ticks from a beginning that all moments of a scene share. Wraps around.
@@ -250,7 +250,7 @@ impl Morphs {
         self.duration > 0
     }
 
-    /// Goes on to the next frame: what it draws as split. Costs some 0.1 ms for each motion that begins.
+    /// Goes on to the next frame: what it draws as split. Costs up to half a millisecond for each motion that begins.
     pub fn step(&mut self, change: &Change) -> Cut {
         let forest = change.layer.forest;
         self.motions.retain(|_, motion| motion.merging || !motion.is_over(change.now));
@@ -429,7 +429,7 @@ impl Start<'_> {
         let before = self.before();
         let mut records: Vec<Record> = slopes.iter().map(|slope| Record::still(normal(*slope))).collect();
         let (n, upper) = (self.surface.block().segments(), self.forest.local(self.d).upper);
-        let mut end = self.now;
+        let (mut end, mut shift) = (self.now, 0.0f32);
         for [p, q] in self.surface.block().places() {
             let slot = Block::slot(n, p, q);
             if heights[slot] == NODATA || (!upper && q > p) {
@@ -443,6 +443,7 @@ impl Start<'_> {
                 if until.since(end) > 0 && record.moves() {
                     end = until;
                 }
+                shift = shift.max((record.to - self.drawn(&record).0).abs());
                 records[slot] = record;
                 continue;
             }
@@ -463,10 +464,9 @@ impl Start<'_> {
         }
         let far = |r: &Record| r.from.abs().max(r.to.abs()).max((r.to - r.from).abs());
         let span = records.iter().map(far).fold(0.0, f32::max);
-        // What the parents' motions add, here and while they go on.
-        let moving = || self.parents.iter().filter_map(|parent| parent.motion);
-        let errors = moving().chain(self.own).map(|motion| motion.error_metres);
-        let shift = moving().map(|motion| motion.span).fold(0.0, f32::max);
+        // It starts from what the parents draw, and its border goes on with them.
+        let errors = self.parents.iter().filter_map(|parent| parent.motion).chain(self.own);
+        let errors = errors.map(|motion| motion.error_metres);
         let error_metres = errors.fold(declared_metres, f32::max) + shift * quantum as f32;
         let merging = way == Way::Home;
         Motion { records, duration: self.duration, end, merging, span, error_metres }
