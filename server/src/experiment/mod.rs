@@ -19,6 +19,7 @@ pub mod view;
 pub mod windows;
 
 mod by_curvature;
+mod progressive;
 mod strips;
 mod tolerances;
 
@@ -91,6 +92,11 @@ pub const ALL: &[Experiment] = &[
         about: "polygons by local curvature, and the pixels that an observer sees change",
         run: by_curvature::run,
     },
+    Experiment {
+        name: "progressive",
+        about: "errors against points and bytes: by level, tolerance, error; quadtree, points payloads, raster",
+        run: progressive::run,
+    },
 ];
 
 /// Why an experiment has no result.
@@ -126,6 +132,9 @@ pub enum ExperimentError {
     /// A plot cannot be drawn.
     #[error("plot: {0}")]
     Plot(String),
+    /// A coder failed, which is a fault of this program.
+    #[error("{0}")]
+    Coding(String),
     /// It was asked to stop.
     #[error("stopped; nothing was written")]
     Stopped,
