@@ -4,7 +4,7 @@ use super::ExperimentError;
 use diamantina_protocol::bintree::Point;
 use plotters::prelude::{
     ChartBuilder, Circle, Color, IntoDrawingArea, LineSeries, Palette, Palette99, PathElement, SVGBackend,
-    WHITE,
+    SeriesLabelPosition, WHITE,
 };
 use std::fmt::Write as _;
 
