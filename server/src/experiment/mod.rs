@@ -20,6 +20,7 @@ pub mod view;
 pub mod windows;
 
 mod by_curvature;
+mod progressive;
 mod strips;
 mod tolerances;
 
@@ -118,6 +119,11 @@ pub const ALL: &[Experiment] = &[
         about: "polygons by local curvature, and the pixels that an observer sees change",
         work: Work::Windows(by_curvature::run),
     },
+    Experiment {
+        name: "progressive",
+        about: "errors against points and bytes: by level, tolerance, error; quadtree, points payloads, raster",
+        work: Work::Windows(progressive::run),
+    },
 ];
 
 /// Why an experiment has no result.
@@ -156,6 +162,9 @@ pub enum ExperimentError {
     /// The flights did not come to an end.
     #[error(transparent)]
     Lod(#[from] lod::LodError),
+    /// A coder failed, which is a fault of this program.
+    #[error("{0}")]
+    Coding(String),
     /// It was asked to stop.
     #[error("stopped; nothing was written")]
     Stopped,

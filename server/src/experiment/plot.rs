@@ -4,7 +4,7 @@ use super::ExperimentError;
 use diamantina_protocol::bintree::Point;
 use plotters::prelude::{
     ChartBuilder, Circle, Color, IntoDrawingArea, LineSeries, Palette, Palette99, PathElement, SVGBackend,
-    WHITE,
+    SeriesLabelPosition, WHITE,
 };
 use std::fmt::Write as _;
 
@@ -75,6 +75,12 @@ pub fn lines(
             chart.draw_series(dots).map_err(|e| failed(&e))?;
         }
         let mut legend = chart.configure_series_labels();
+        // Errors fall with what was sent.
+        legend.position(if is_log {
+            SeriesLabelPosition::LowerLeft
+        } else {
+            SeriesLabelPosition::UpperRight
+        });
         legend.background_style(WHITE.mix(0.8)).border_style(Palette99::pick(7).mix(0.3));
         legend.label_font(("sans-serif", 14)).draw().map_err(|e| failed(&e))?;
         area.present().map_err(|e| failed(&e))?;

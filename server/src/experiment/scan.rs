@@ -6,6 +6,8 @@
 
 use super::field::Field;
 use diamantina_protocol::bintree::Point;
+use diamantina_protocol::bitree::Bitree;
+use std::ops::ControlFlow;
 
 /// A triangle's plane: height at x, y = 0 of the grid, slopes along x and y in metres a cell.
 #[derive(Debug, Clone, Copy)]
@@ -93,6 +95,25 @@ pub fn vertical_error(
     worst
 }
 
+/// The height of a bitree's surface at each sample, data or not.
+#[must_use]
+pub fn surface(field: &Field, tree: &Bitree) -> Vec<f64> {
+    let mut heights = vec![0.0; field.heights().len()];
+    for root in tree.roots() {
+        let _ = tree.leaves(&root, &mut |facet| {
+            let plane = Plane::new(facet.corners(), facet.heights());
+            rows(facet.corners(), |y, first, last| {
+                for x in first..=last {
+                    heights[field.slot([x, y])] = plane.at([x, y]);
+                }
+                true
+            });
+            ControlFlow::Continue(())
+        });
+    }
+    heights
+}
+
 /// Over one run; comparisons with NaN are false, so samples without data never count.
 fn row_error(heights: &[f64], weights: Option<&[f32]>, start: f64, slope: f64) -> f64 {
     let mut worst = [0.0f64; 4];
@@ -128,9 +149,7 @@ fn row_error(heights: &[f64], weights: Option<&[f32]>, start: f64, slope: f64) -
 #[cfg(test)]
 mod tests {
     use super::*;
-    use diamantina_protocol::bitree::Bitree;
     use std::collections::BTreeSet;
-    use std::ops::ControlFlow;
 
     #[test]
     fn rows_visit_exactly_the_samples_in_each_triangle() {

@@ -1,0 +1,331 @@
+//! What a receiver has after each part of a progressive transmission: errors against points and bytes.
+//!
+//! Heights are whole units (1 m where all are whole metres, else 1 cm), and every scheme ends with exactly those.
+//!
+//! | scheme | order | bytes |
+//! |---|---|---|
+//! | `level` | the bitree's points off their means, level by level | batches |
+//! | `tolerance` | the bitree refined to half the tolerance again and again; what an earlier batch has stays | batches |
+//! | `error` | the bitree's worst triangle first, twice as many points a batch | batches |
+//! | `quadtree` | the points of `tolerance` with all that a restricted quadtree makes them depend on | batches |
+//! | `points midpoint`, `points smooth` | all points, level by level | the payloads of `protocol::points`, lossless, with the model that knows nothing of the layer |
+//! | `raster` | all at once | differences from the western neighbour, 2 bytes each where they fit, zstd |
+//!
+//! A batch is a list of points in raster order: for each the gap to the one before and the difference
+//! between its height and the one that the receiver deduces there, both as numbers of 7 bits a byte, in two columns;
+//! zstd at level 19 over both. The four corners open the first batch, 4 bytes each.
+
+use super::field::Field;
+use super::report::{Picture, Report, Table};
+use super::scan::surface;
+use super::select::{Ground, greedy};
+use super::windows::Window;
+use super::{Criterion, ExperimentError, Run, plot, quadtree};
+use diamantina_protocol::NODATA;
+use diamantina_protocol::bintree::Forest;
+use diamantina_protocol::bitree::{Bitree, level};
+use diamantina_protocol::diamond::{Block, Diamond};
+use diamantina_protocol::points::{self, Coding, Rule};
+use std::collections::HashMap;
+
+/// The share of a triangle's error at its middle for that to become real: see the selections.
+const SHARE: f64 = 0.3;
+const ZSTD_LEVEL: i32 = 19;
+/// Bytes of a corner's height.
+const CORNER_BYTES: usize = 4;
+
+/// What a receiver has at some time.
+struct Step {
+    points: usize,
+    bytes: usize,
+    max: f64,
+    rms: f64,
+}
+
+pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
+    let columns = ["DEM", "x", "y", "scheme", "points", "bytes", "largest error [m]", "RMS error [m]"];
+    let mut table = Table::new("progressive", "After each part of the transmission", &columns);
+    let mut pictures = Vec::new();
+    run.progress.stage("transmitting", "windows", run.windows.len() as u64, 0);
+    for (i, window) in run.windows.iter().enumerate() {
+        if run.progress.is_stopping() {
+            return Err(ExperimentError::Stopped);
+        }
+        let schemes = schemes(window)?;
+        for (name, steps) in &schemes {
+            for s in steps {
+                let place = [window.source.clone(), window.at[0].to_string(), window.at[1].to_string()];
+                let found = [
+                    s.points.to_string(),
+                    s.bytes.to_string(),
+                    format!("{:.3}", s.max),
+                    format!("{:.3}", s.rms),
+                ];
+                table.push(place.into_iter().chain([(*name).to_owned()]).chain(found));
+            }
+        }
+        if i == 0 {
+            pictures = plots(&window.source, &schemes)?;
+        }
+        run.progress.advance(1);
+    }
+    let notes = vec![
+        "Plots are of the first window, with logarithms; the last step of each scheme, without error, has no place on them."
+            .to_owned(),
+    ];
+    Ok(Report { title: "Progressive transmission".to_owned(), notes, tables: vec![table], pictures })
+}
+
+type Scheme = (&'static str, Vec<Step>);
+
+fn schemes(window: &Window) -> Result<Vec<Scheme>, ExperimentError> {
+    let (field, unit) = whole_units(&window.field);
+    if field.log2() < 3 {
+        return Err(ExperimentError::Options {
+            option: "--samples",
+            expected: "9 or more, for the points encoding".to_owned(),
+            found: field.row().to_string(),
+        });
+    }
+    let tolerances = by_tolerance(&field);
+    let closed: Vec<Bitree> = tolerances.iter().map(|tree| quadtree::close(&field, tree)).collect();
+    let bitrees = [
+        ("level", by_level(&field)),
+        ("tolerance", tolerances),
+        ("error", by_error(&field)),
+        ("quadtree", closed),
+    ];
+    let mut list: Vec<Scheme> = Vec::new();
+    for (name, trees) in bitrees {
+        list.push((name, batches(&field, unit, &trees)?));
+    }
+    list.push(("points midpoint", payloads(&field, unit, Rule::Midpoint)?));
+    list.push(("points smooth", payloads(&field, unit, Rule::Smooth)?));
+    let bytes = compress(&raster(&units(&field), field.row()))?.len();
+    list.push(("raster", vec![Step { points: field.samples(), bytes, max: 0.0, rms: 0.0 }]));
+    Ok(list)
+}
+
+/// The field with heights of whole units, and the unit in metres.
+fn whole_units(field: &Field) -> (Field, f64) {
+    let unit = if field.heights().iter().all(|h| h.is_nan() || h.fract() == 0.0) { 1.0 } else { 0.01 };
+    let heights = field.heights().iter().map(|h| (h / unit).round()).collect();
+    (Field::new(field.log2(), heights, field.cell()).unwrap_or_else(|| field.clone()), unit)
+}
+
+/// Heights as integers; the field has whole units.
+fn units(field: &Field) -> Vec<i32> {
+    #[allow(clippy::cast_possible_truncation, reason = "heights of terrain, in centimetres at most")]
+    field.heights().iter().map(|h| if h.is_nan() { NODATA } else { *h as i32 }).collect()
+}
+
+/// The points that are off their means, by level; the first is the corners alone.
+fn by_level(field: &Field) -> Vec<Bitree> {
+    let full = field.full_tree();
+    let mut trees = vec![field.tree()];
+    for l in 1..=2 * u32::from(field.log2()) {
+        let mut tree = trees[trees.len() - 1].clone();
+        for slot in 0..field.heights().len() {
+            let p = field.point(slot);
+            if level(field.log2(), p) == l
+                && let Some(facet) = full.around(p).into_iter().flatten().next()
+                && let [ha, _, hb] = facet.heights()
+                && !field.at(p).is_nan()
+                && field.at(p) != (ha + hb) / 2.0
+            {
+                tree.add(p, field.at(p));
+            }
+        }
+        trees.push(tree);
+    }
+    trees
+}
+
+/// Refined to half the tolerance again and again, from the relief down to one unit, then to none.
+fn by_tolerance(field: &Field) -> Vec<Bitree> {
+    let Some(ground) = Ground::new(field, None) else { return Vec::new() };
+    let mut trees = vec![field.tree()];
+    let mut tolerance = field.relief() / 2.0;
+    while tolerance > 0.0 {
+        tolerance = if tolerance < 1.0 { 0.0 } else { tolerance };
+        let before = trees[trees.len() - 1].clone();
+        trees.push(greedy(&ground, Criterion::Vertical, tolerance, SHARE, usize::MAX, before));
+        tolerance /= 2.0;
+    }
+    trees
+}
+
+/// The worst first, twice as many points each time.
+fn by_error(field: &Field) -> Vec<Bitree> {
+    let Some(ground) = Ground::new(field, None) else { return Vec::new() };
+    let mut trees = vec![field.tree()];
+    loop {
+        let before = trees[trees.len() - 1].clone();
+        let points = before.points().0;
+        let next = greedy(&ground, Criterion::Vertical, 0.0, SHARE, 2 * points, before);
+        let is_done = next.points().0 < 2 * points;
+        trees.push(next);
+        if is_done {
+            return trees;
+        }
+    }
+}
+
+/// The batches that lead from each selection to the next.
+fn batches(field: &Field, unit: f64, trees: &[Bitree]) -> Result<Vec<Step>, ExperimentError> {
+    let (mut steps, mut bytes) = (Vec::new(), 4 * CORNER_BYTES);
+    let mut before: Option<&Bitree> = None;
+    for tree in trees {
+        if let Some(before) = before {
+            bytes += compress(&batch(field, before, tree))?.len();
+        }
+        steps.push(step(field, unit, tree, tree.points().0, bytes));
+        before = Some(tree);
+    }
+    Ok(steps)
+}
+
+/// The points of `after` that `before` has not: gaps, then differences from what is deduced.
+fn batch(field: &Field, before: &Bitree, after: &Bitree) -> Vec<u8> {
+    let (mut gaps, mut differences, mut last) = (Vec::new(), Vec::new(), 0u64);
+    for (slot, at) in (0..field.heights().len()).zip(0u64..) {
+        let p = field.point(slot);
+        let Some(height) = after.real(p).filter(|_| before.real(p).is_none()) else { continue };
+        let around = before.around(p).into_iter().flatten().next();
+        let deduced =
+            around.map_or(0.0, |facet| f64::midpoint(facet.heights()[0], facet.heights()[2]).round());
+        #[allow(clippy::cast_possible_truncation, reason = "heights of terrain, in centimetres at most")]
+        let difference = (height - deduced).round() as i64;
+        varint(&mut gaps, at - last);
+        varint(&mut differences, ((difference << 1) ^ (difference >> 63)).cast_unsigned());
+        last = at;
+    }
+    gaps.extend(differences);
+    gaps
+}
+
+/// 7 bits a byte, the lowest first.
+fn varint(out: &mut Vec<u8>, mut value: u64) {
+    while value >= 128 {
+        out.push((value & 127) as u8 | 128);
+        value >>= 7;
+    }
+    out.push((value & 127) as u8);
+}
+
+fn compress(bytes: &[u8]) -> Result<Vec<u8>, ExperimentError> {
+    zstd::bulk::compress(bytes, ZSTD_LEVEL).map_err(|e| ExperimentError::Coding(format!("zstd: {e}")))
+}
+
+/// Differences from the western neighbour, 2 bytes each if all fit, else 4.
+fn raster(heights: &[i32], row: usize) -> Vec<u8> {
+    let differences: Vec<i32> = heights
+        .chunks(row)
+        .flat_map(|line| line.iter().scan(0i32, |west, h| Some(h.wrapping_sub(std::mem::replace(west, *h)))))
+        .collect();
+    match differences.iter().map(|d| i16::try_from(*d)).collect::<Result<Vec<_>, _>>() {
+        Ok(short) => short.into_iter().flat_map(i16::to_le_bytes).collect(),
+        Err(_) => differences.into_iter().flat_map(i32::to_le_bytes).collect(),
+    }
+}
+
+fn step(field: &Field, unit: f64, tree: &Bitree, points: usize, bytes: usize) -> Step {
+    let surface = surface(field, tree);
+    let errors = surface.iter().zip(field.heights()).map(|(s, h)| (s - h).abs()).filter(|e| !e.is_nan());
+    let (max, squares, n) = errors.fold((0.0f64, 0.0, 0u32), |(m, s, n), e| (m.max(e), s + e * e, n + 1));
+    Step { points, bytes, max: unit * max, rms: unit * (squares / f64::from(n.max(1))).sqrt() }
+}
+
+/// Level by level by the points encoding. The last level is checked to be the field itself.
+fn payloads(field: &Field, unit: f64, rule: Rule) -> Result<Vec<Step>, ExperimentError> {
+    let patch_log2 = field.log2().saturating_sub(4).clamp(2, 6);
+    let wrong = |e: &dyn std::fmt::Display| ExperimentError::Coding(format!("points encoding: {e}"));
+    let forest = Forest::new(field.log2(), patch_log2, [1, 1]).map_err(|e| wrong(&e))?;
+    let coding = Coding::new(rule, 1, vec![0; forest.levels() as usize + 1]).map_err(|e| wrong(&e))?;
+    let source = units(field);
+    let (mut steps, mut bytes) = (Vec::new(), 0);
+    let mut before: HashMap<Diamond, Block> = HashMap::new();
+    for l in 0..forest.levels() {
+        let mut here = HashMap::new();
+        for d in forest.diamonds(l) {
+            let mut block = Block::empty(&forest, l);
+            for parent in forest.parents(d) {
+                block.inherit(&forest, d, parent, &before[&parent]);
+            }
+            let mut whole = Block::empty(&forest, l);
+            whole.fill(&forest.local(d), |x, y| source[field.slot([x, y])]);
+            let mut received = block.clone();
+            let payload = points::encode(&forest, &coding, d, &mut block, &whole);
+            points::decode(&forest, &coding, d, &mut received, &payload).map_err(|e| wrong(&e))?;
+            if received != whole {
+                return Err(wrong(&"a diamond came back changed"));
+            }
+            bytes += payload.len();
+            here.insert(d, received);
+        }
+        before = here;
+        // The root's payload has its own points and the centres between; each level adds the next.
+        let known = 2 * u32::from(patch_log2) + l + 1;
+        let mut tree = field.tree();
+        for (slot, height) in field.heights().iter().enumerate() {
+            if level(field.log2(), field.point(slot)) <= known {
+                tree.add(field.point(slot), *height);
+            }
+        }
+        let count = tree.points().0;
+        steps.push(step(field, unit, &tree, count, bytes));
+    }
+    Ok(steps)
+}
+
+fn plots(source: &str, schemes: &[Scheme]) -> Result<Vec<Picture>, ExperimentError> {
+    let plot = |file: &str, title: &str, x: &str, y: &str, at: &dyn Fn(&Step) -> [f64; 2]| {
+        let series: Vec<plot::Series> = schemes
+            .iter()
+            .filter(|(name, _)| *name != "raster")
+            .map(|(name, steps)| plot::Series {
+                name: (*name).to_owned(),
+                points: steps.iter().map(at).collect(),
+            })
+            .collect();
+        let bytes = plot::lines(&format!("{source}: {title}"), [x, y], true, &series)?;
+        Ok::<_, ExperimentError>(Picture { file: file.to_owned(), caption: title.to_owned(), bytes })
+    };
+    let max = "largest error [m]";
+    let rms = "RMS error [m]";
+    Ok(vec![
+        plot("max-bytes.svg", "largest error against bytes", "bytes", max, &|s| [s.bytes as f64, s.max])?,
+        plot("rms-bytes.svg", "RMS error against bytes", "bytes", rms, &|s| [s.bytes as f64, s.rms])?,
+        plot("max-points.svg", "largest error against points", "points", max, &|s| [s.points as f64, s.max])?,
+        plot("rms-points.svg", "RMS error against points", "points", rms, &|s| [s.points as f64, s.rms])?,
+    ])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_scheme_ends_without_error_and_selections_only_grow() {
+        let heights: Vec<f64> =
+            (0..33 * 33u32).map(|s| f64::from(s % 33 * (s / 33) % 29 + s.wrapping_mul(40_503) % 5)).collect();
+        let field = Field::new(5, heights, [30.0, 30.0]).unwrap();
+        let window = Window { source: "made".to_owned(), at: [0, 0], field, weights: None };
+        for (name, steps) in schemes(&window).unwrap() {
+            assert_eq!(steps.last().unwrap().max, 0.0, "{name}");
+            assert!(
+                steps.windows(2).all(|w| w[0].points <= w[1].points && w[0].bytes <= w[1].bytes),
+                "{name}"
+            );
+        }
+    }
+
+    #[test]
+    fn numbers_of_seven_bits() {
+        let mut out = Vec::new();
+        for v in [0, 127, 128, 300] {
+            varint(&mut out, v);
+        }
+        assert_eq!(out, [0, 127, 128, 1, 172, 2]);
+    }
+}
