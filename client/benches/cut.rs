@@ -3,6 +3,7 @@
 use criterion::{Criterion, Throughput};
 use diamantina_client::camera::{Camera, FOV_Y};
 use diamantina_client::cut::{self, Ask};
+use diamantina_client::sight::Sight;
 use diamantina_client::surface::Surface;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
@@ -52,7 +53,15 @@ fn main() {
     let camera =
         Camera { eye, target: eye + DVec3::new(1e5, 4e5, -60_000.0), fov_y: FOV_Y, size: [1380, 768] };
     let memory_bytes = SPLITS * Surface::bytes(&layer.forest, 0);
-    let ask = Ask { layer: &layer, camera: &camera, exaggeration: 1.0, tolerance_pixels: 1e-3, memory_bytes };
+    let ask = Ask {
+        layer: &layer,
+        camera: &camera,
+        exaggeration: 1.0,
+        tolerance_pixels: 1e-3,
+        sight: Sight::default(),
+        seen: None,
+        memory_bytes,
+    };
     let root = layer.forest.root_diamonds().next().expect("a forest has roots");
     let surface = Arc::new(Surface::split(&layer, root, &[], &[]).expect("no bytes are a payload"));
     let ideal = cut::choose(&ask, entry);

@@ -193,7 +193,7 @@ mod tests {
             let mut mask = cast(&ground.relief, &optics, &eyes, &Progress::hidden()).unwrap();
             let width = ground.relief.size()[0];
             ground.own(&rings, |[x, y]| mask[y * width + x] = 255);
-            let part = Part { ceiling, rings: rings.clone() };
+            let part = Part { ceiling, rings };
             let [mut inside, mut seen, mut missed] = [0, 0, 0];
             while inside < 12 {
                 let point = [500.0 + 600.0 * roll(), -300.0 + 600.0 * roll()];
@@ -231,7 +231,9 @@ mod tests {
         });
         assert!(owned.contains(&[10, 10]) && owned.contains(&[20, 20]) && owned.contains(&[11, 15]));
         assert!(!owned.contains(&[15, 15]) && !owned.contains(&[9, 15]) && !owned.contains(&[22, 15]));
-        assert!(ground.holds(&[rings.clone()]) && !ground.holds(&[vec![square(1095.0, 0.0, 10.0)]]));
+        assert!(
+            ground.holds(std::slice::from_ref(&rings)) && !ground.holds(&[vec![square(1095.0, 0.0, 10.0)]])
+        );
         let inner = (10..=20).flat_map(|x| (10..=20).map(move |y| [x, y]));
         let inner = inner.filter(|p| !p.iter().all(|w| (14..=16).contains(w)));
         let highest = inner.map(|p| ground.relief.at(p)).max().unwrap();
