@@ -45,9 +45,8 @@ const WINDOWS_MAX: usize = 16;
 /// Slopes closer than this are the same: some thousand times the rounding of the arithmetic.
 const SAME: f64 = 1e-11;
 
-/// The largest share that is told of a block as one, of small blocks and of large ones. Where more is open to doubt,
-/// what is in it tells better.
-const BLOCK_SHARES_MAX: [f64; 2] = [0.25, 0.1];
+/// The largest share that is told of a small block as one. Where more is open to doubt, its cells tell better.
+const BLOCK_SHARE_MAX: f64 = 0.2;
 
 /// Azimuths that are worked on at once.
 const AZIMUTHS_AT_ONCE: usize = 512;
@@ -132,62 +131,49 @@ pub fn cast(relief: &Relief, optics: &Optics, eyes: &[Eye], progress: &Progress)
 /// What has been seen so far, in 255ths: of samples, and of whole blocks.
 struct Sheets {
     floor: u8,
-    samples: Sheet,
-    blocks: [Sheet; 2],
-}
-
-struct Sheet {
     size: [usize; 2],
-    shares: Vec<AtomicU8>,
-}
-
-impl Sheet {
-    fn new(size: [usize; 2], floor: u8) -> Self {
-        Self { size, shares: (0..size[0] * size[1]).map(|_| AtomicU8::new(floor)).collect() }
-    }
-
-    fn raise(&self, [x, y]: [usize; 2], share: u8) {
-        let here = &self.shares[y * self.size[0] + x];
-        // Most are known already, and looking costs less than changing.
-        if here.load(Ordering::Relaxed) < share {
-            here.fetch_max(share, Ordering::Relaxed);
-        }
-    }
+    samples: Vec<AtomicU8>,
+    blocks_size: [usize; 2],
+    blocks: Vec<AtomicU8>,
 }
 
 impl Sheets {
     fn new(relief: &Relief, floor: u8) -> Self {
-        let blocks = [0, 1].map(|which| Sheet::new(relief.blocks_size(which), floor));
-        Self { floor, samples: Sheet::new(relief.size(), floor), blocks }
+        let sheet = |[w, h]: [usize; 2]| (0..w * h).map(|_| AtomicU8::new(floor)).collect();
+        let (size, blocks_size) = (relief.size(), relief.blocks_size());
+        Self { floor, size, samples: sheet(size), blocks_size, blocks: sheet(blocks_size) }
     }
 
     fn note(&self, seen: &Seen) {
         let share = stepped(seen.share, self.floor);
+        let raise = |sheet: &[AtomicU8], width: usize, [x, y]: [usize; 2]| {
+            let here = &sheet[y * width + x];
+            // Most are known already, and looking costs less than changing.
+            if here.load(Ordering::Relaxed) < share {
+                here.fetch_max(share, Ordering::Relaxed);
+            }
+        };
         match seen.region {
-            Region::Triangle(corners) => corners.iter().for_each(|c| self.samples.raise(*c, share)),
+            Region::Triangle(corners) => corners.iter().for_each(|c| raise(&self.samples, self.size[0], *c)),
             Region::Cell([x, y]) => [[x, y], [x + 1, y], [x, y + 1], [x + 1, y + 1]]
                 .iter()
-                .for_each(|c| self.samples.raise(*c, share)),
-            Region::Block(which, block) => self.blocks[which].raise(block, share),
+                .for_each(|c| raise(&self.samples, self.size[0], *c)),
+            Region::Block(block) => raise(&self.blocks, self.blocks_size[0], block),
         }
     }
 
-    /// The shares of all samples, with those of the blocks around them, borders included.
     fn merged(self) -> Vec<u8> {
-        let size = self.samples.size;
-        let mut samples: Vec<u8> = self.samples.shares.into_iter().map(AtomicU8::into_inner).collect();
-        for (blocks, log2) in self.blocks.into_iter().zip(BLOCKS_LOG2) {
-            let side = 1usize << log2;
-            for (i, share) in blocks.shares.into_iter().map(AtomicU8::into_inner).enumerate() {
-                if share == self.floor {
-                    continue;
-                }
-                let [x, y] = [i % blocks.size[0] * side, i / blocks.size[0] * side];
-                for y in y..=(y + side).min(size[1] - 1) {
-                    let row = y * size[0];
-                    for sample in &mut samples[row + x..=row + (x + side).min(size[0] - 1)] {
-                        *sample = (*sample).max(share);
-                    }
+        let mut samples: Vec<u8> = self.samples.into_iter().map(AtomicU8::into_inner).collect();
+        let side = 1usize << BLOCKS_LOG2[0];
+        for (i, share) in self.blocks.into_iter().map(AtomicU8::into_inner).enumerate() {
+            let [x, y] = [i % self.blocks_size[0] * side, i / self.blocks_size[0] * side];
+            if share == self.floor {
+                continue;
+            }
+            for y in y..=(y + side).min(self.size[1] - 1) {
+                let row = y * self.size[0];
+                for sample in &mut samples[row + x..=row + (x + side).min(self.size[0] - 1)] {
+                    *sample = (*sample).max(share);
                 }
             }
         }
@@ -208,8 +194,8 @@ pub enum Region {
     Triangle([[usize; 2]; 3]),
     /// A cell, by its south-west sample.
     Cell([usize; 2]),
-    /// A block of a kind of [`BLOCKS_LOG2`], by its place among them.
-    Block(usize, [usize; 2]),
+    /// A block of the smaller kind, by its place among the blocks.
+    Block([usize; 2]),
 }
 
 /// A part of the relief that is seen, or nearly.
@@ -413,8 +399,8 @@ impl<F: FnMut(Seen)> Walk<'_, F> {
         }
     }
 
-    /// The line at the end of a column of blocks, where all that the plane crosses in it is hidden well: it is told as
-    /// one then.
+    /// The line at the end of a column of blocks, where all that the plane crosses in it is hidden: it is told as one
+    /// then. Large blocks bound little, so they are passed over only if nothing is to be told.
     fn beyond(&mut self, which: usize, block: usize, from: f64) -> Option<usize> {
         let plane = &self.plane;
         let log2 = BLOCKS_LOG2[which];
@@ -433,11 +419,11 @@ impl<F: FnMut(Seen)> Walk<'_, F> {
         }
         let share = self.sky.share(slopes);
         if share > self.sky.least {
-            if share > BLOCK_SHARES_MAX[which] {
+            if which > 0 || share > BLOCK_SHARE_MAX {
                 return None;
             }
             for block in blocks {
-                (self.visit)(Seen { region: Region::Block(which, block), slopes, share });
+                (self.visit)(Seen { region: Region::Block(block), slopes, share });
             }
         }
         Some(line)

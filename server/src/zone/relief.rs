@@ -67,9 +67,9 @@ impl Relief {
         self.size
     }
 
-    /// Blocks of a kind along x and y.
-    pub(super) fn blocks_size(&self, which: usize) -> [usize; 2] {
-        self.blocks[which].size
+    /// Blocks of the smaller kind along x and y.
+    pub(super) fn blocks_size(&self) -> [usize; 2] {
+        self.blocks[0].size
     }
 
     /// The height of a sample.

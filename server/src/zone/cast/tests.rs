@@ -105,10 +105,7 @@ fn inside(relief: &Relief, region: Region) -> Vec<[[usize; 2]; 3]> {
     let cells = match region {
         Region::Triangle(corners) => return vec![sorted(corners)],
         Region::Cell([x, y]) => [x..x + 1, y..y + 1],
-        Region::Block(which, block) => {
-            let log2 = BLOCKS_LOG2[which];
-            block.map(|b| b << log2..(b + 1) << log2)
-        }
+        Region::Block(block) => block.map(|b| b << BLOCKS_LOG2[0]..(b + 1) << BLOCKS_LOG2[0]),
     };
     let holds = |t: &[[usize; 2]; 3]| {
         (0..2).all(|axis| cells[axis].contains(&t.iter().map(|c| c[axis]).min().unwrap()))
