@@ -285,7 +285,7 @@ fn every_prefix_covers_the_forest_once_without_cracks() {
             shared += assert_no_cracks(&layer, &drawing.items, false);
             let all_roots = roots == layer.forest.root_diamonds().filter(|r| !entries[r].is_empty()).count();
             assert_eq!(drawing.items.is_empty(), !all_roots, "something is drawn from the last root on");
-            assert!(!all_roots || drawing.splits == reader.order.len(), "all that arrived is drawn");
+            assert!(!all_roots || drawing.splits.len() == reader.order.len(), "all that arrived is drawn");
         }
         assert!(shared > 0, "{question:?}");
     }
