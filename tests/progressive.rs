@@ -16,6 +16,7 @@ use diamantina_protocol::message::{
     self, FrameHeader, Layer, STREAM_MAX, Status, StreamAsk, StreamView, stream_route,
 };
 use diamantina_protocol::points;
+use diamantina_protocol::sight;
 use diamantina_server::curve;
 use diamantina_server::hierarchy;
 use diamantina_server::ingest;
@@ -58,7 +59,8 @@ fn questions(layer: &Layer) -> Vec<StreamAsk> {
         Some([x0, y0, x1, y1])
     };
     let [x, y] = at(0.2, 0.1);
-    let around = StreamView { eye: [x, y, layer.heights[1] + 500.0], angle: 1e-3, sides: Vec::new() };
+    let around =
+        StreamView { eye: [x, y, layer.heights[1] + 500.0], angle: 1e-3, sides: Vec::new(), vertical: false };
     let sides = vec![[1.0, 0.3, 0.0], [-0.4, 1.0, 0.1]];
     let ahead = StreamView { sides, angle: 3e-4, ..around };
     let all = StreamAsk::default();
@@ -69,6 +71,7 @@ fn questions(layer: &Layer) -> Vec<StreamAsk> {
         StreamAsk { bbox: bbox(0.25, 0.25, 0.25, 0.25), ..all.clone() },
         StreamAsk { bbox: bbox(-1.0, 0.5, 2.0, 0.5), error: 5.0, ..all.clone() },
         StreamAsk { bbox: bbox(-3.0, -3.0, -2.0, -2.0), ..all.clone() },
+        StreamAsk { view: Some(StreamView { vertical: true, ..around.clone() }), ..all.clone() },
         StreamAsk { view: Some(around), ..all.clone() },
         StreamAsk { view: Some(ahead.clone()), error: 1.0, ..all.clone() },
         StreamAsk { view: Some(ahead), bbox: bbox(0.0, 0.0, 0.5, 1.0), ..all.clone() },
@@ -156,7 +159,12 @@ impl<'a> Reader<'a> {
             .sides
             .iter()
             .all(|side| corners.clone().any(|corner| DVec3::from_array(*side).dot(corner - eye) >= 0.0));
-        let apparent = error / (eye.clamp(low, high) - eye).length();
+        let mut apparent = error / (eye.clamp(low, high) - eye).length();
+        if view.vertical
+            && sight::is_vertical(&self.layer.forest, d.level(), entry.error_metres, self.layer.cell)
+        {
+            apparent = apparent.min(sight::vertical_angle(view.eye, error, low.to_array(), high.to_array()));
+        }
         (seen && apparent > view.angle).then_some(apparent)
     }
 }

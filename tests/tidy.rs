@@ -13,6 +13,7 @@ const PROTOCOL: &[(&str, &[&str])] = &[
     ("points", &["bintree", "bitree", "diamond", "rans"]),
     ("tin", &["bintree", "bitree", "diamond", "rans"]),
     ("index", &["bintree", "diamond", "wire"]),
+    ("sight", &["bintree"]),
     ("message", &["bintree", "diamond", "points", "wire", "zone"]),
     ("zone", &["bintree", "diamond"]),
     ("wire", &[]),

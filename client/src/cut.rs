@@ -24,6 +24,7 @@ use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::{self, Entry};
 use diamantina_protocol::message::Layer;
+use diamantina_protocol::sight::is_vertical;
 use diamantina_protocol::zone::Mask;
 use foldhash::fast::RandomState;
 use glam::DVec3;
@@ -77,9 +78,7 @@ impl Ask<'_> {
     /// far as it counts.
     fn pixels(&self, d: Diamond, level: u32, error_metres: f32, bounds: &Bounds) -> f64 {
         let layer = self.layer;
-        // Where outlines differ, the length of a hypotenuse is part of the error; what is below it is of heights.
-        let vertical = level >= layer.forest.levels()
-            || f64::from(error_metres) < layer.forest.hypotenuse(level, layer.cell);
+        let vertical = is_vertical(&layer.forest, level, error_metres, layer.cell);
         // Heights pressed together leave the errors of outlines as they are.
         let stretch = if vertical { self.exaggeration } else { self.exaggeration.max(1.0) };
         let error =

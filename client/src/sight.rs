@@ -1,23 +1,11 @@
 //! How large an error looks on the screen: metres and a box become pixels.
 //!
 //! The plain measure takes an error for a sphere: as large as it looks from the nearest point of the box,
-//! whatever the direction. But what errs is a height, and a point that moves up or down does not move on the
-//! screen for an eye that looks along the vertical. The trick is a bound that knows it, over a whole box:
-//!
-//! ```text
-//!    eye +--------- r ---------+         An eye t above a point, r away from it on the ground, sees the
-//!        |                     |         point's height change by dt as an angle of r dt / (r^2 + t^2).
-//!        t                     :         Where t may be anything from t0 on and r from r0 to r1, that is
-//!        |                     :         most at t = t0 and r = t0, or at the end of r0..r1 nearest to it.
-//!        +---------------------* dt
-//! ```
-//!
-//! Heights err by at most `error`, so t0 is the eye's distance, along the vertical, from the box with `error`
-//! added above and below: all of the way of a point from the drawn height to the true one lies in it, and the
-//! angle is the integral of what is bounded here. Pure functions.
+//! whatever the direction. An error of heights is bounded more tightly, as [`diamantina_protocol::sight`] tells. Pure
+//! functions.
 
 use crate::camera::{Bounds, Camera};
-use glam::{DVec2, DVec3};
+use diamantina_protocol::sight::vertical_angle;
 
 /// How errors count.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -56,7 +44,12 @@ impl Sight {
         }
         let mut angle = error.metres / bounds.distance(camera.eye).max(nearest);
         if self.vertical && error.vertical {
-            angle = angle.min(vertical_angle(camera.eye, error.metres, bounds));
+            angle = angle.min(vertical_angle(
+                camera.eye.to_array(),
+                error.metres,
+                bounds.min.to_array(),
+                bounds.max.to_array(),
+            ));
         }
         // What is hidden must not rise above what hides it: that bounds it in all of the picture alike.
         let counts = if error.share < 1.0 { error.share } else { self.weight(camera, bounds) };
@@ -85,23 +78,11 @@ impl Sight {
     }
 }
 
-/// The largest angle, in radians, by which a point of a box moves as seen from `eye` when its height changes by
-/// at most `error` metres; infinite where the eye may be as near as that.
-fn vertical_angle(eye: DVec3, error: f64, bounds: &Bounds) -> f64 {
-    let above = (bounds.min.z - error - eye.z).max(eye.z - bounds.max.z - error).max(0.0);
-    let flat = |p: DVec3| DVec2::new(p.x, p.y);
-    let (eye, min, max) = (flat(eye), flat(bounds.min), flat(bounds.max));
-    let nearest = (eye.clamp(min, max) - eye).length();
-    let farthest = (min - eye).abs().max((max - eye).abs()).length();
-    let away = above.clamp(nearest, farthest);
-    let squares = away * away + above * above;
-    if squares > 0.0 { error * away / squares } else { f64::INFINITY }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::camera::FOV_Y;
+    use glam::DVec3;
     use proptest::prelude::*;
 
     fn camera(eye: DVec3, target: DVec3) -> Camera {
@@ -124,31 +105,6 @@ mod tests {
     }
 
     proptest! {
-        /// No point of the box that is drawn too high or too low by the error, or less, is seen farther from its
-        /// true place than the bound says.
-        #[test]
-        fn no_vertical_error_looks_larger_than_its_bound(
-            bounds in any_bounds(),
-            eye in prop::array::uniform3(-3e3..3e3f64),
-            above in prop::sample::select(vec![false, true]),
-            error in 0.0..200.0f64,
-            at in unit3(),
-            part in -1.0..=1.0f64,
-        ) {
-            let mut eye = DVec3::from_array(eye);
-            if above {
-                // Straight above or below some point of it: where the bound differs most from the sphere's.
-                let under = in_box(&bounds, at);
-                eye = DVec3::new(under.x, under.y, eye.z);
-            }
-            let truth = in_box(&bounds, at);
-            let drawn = truth + DVec3::Z * error * part;
-            let seen = (truth - eye).angle_between(drawn - eye);
-            prop_assume!(seen.is_finite());
-            let bound = vertical_angle(eye, error, &bounds);
-            prop_assert!(seen <= bound * (1.0 + 1e-9) + 1e-7, "{} > {}", seen, bound);
-        }
-
         /// What lies in a box looks no larger than the box's own errors: a cut's parents come first.
         #[test]
         fn a_part_of_a_box_with_less_error_looks_no_larger(

@@ -370,7 +370,7 @@ impl Terrain {
         let flat = |plane: &Plane| (plane.normal * DVec3::new(1.0, 1.0, exaggeration)).normalize().to_array();
         let sides = camera.planes().iter().map(flat).collect();
         let eye = camera.eye.with_z(camera.eye.z / exaggeration).to_array();
-        let view = StreamView { eye, angle, sides };
+        let view = StreamView { eye, angle, sides, vertical: self.options.sight.vertical };
         for layer in 0..self.layers.len() {
             self.fetcher.stream(layer, StreamAsk { view: Some(view.clone()), ..StreamAsk::default() });
         }

@@ -17,6 +17,7 @@ use diamantina_protocol::message::{
     self, Catalogue, Frame, FrameHeader, Kind, Layer, Scene, Status, StreamAsk,
 };
 use diamantina_protocol::points::{self, Coding, Rule};
+use diamantina_protocol::sight;
 use glam::DVec3;
 use std::collections::{HashMap, HashSet};
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -496,8 +497,12 @@ fn wanted(built: &Built, ask: &StreamAsk) -> Vec<Diamond> {
         let low = DVec3::new(low[0], low[1], layer.metres(entry.low));
         let high = DVec3::new(high[0], high[1], layer.metres(entry.high));
         let eye = DVec3::from_array(view.eye);
-        let distance = (eye.clamp(low, high) - eye).length();
-        !entry.is_empty() && (d.level() == 0 || f64::from(entry.error_metres) > view.angle * distance)
+        let error = f64::from(entry.error_metres);
+        let mut angle = error / (eye.clamp(low, high) - eye).length();
+        if view.vertical && sight::is_vertical(&layer.forest, d.level(), entry.error_metres, layer.cell) {
+            angle = angle.min(sight::vertical_angle(view.eye, error, low.to_array(), high.to_array()));
+        }
+        !entry.is_empty() && (d.level() == 0 || angle > view.angle)
     };
     let mut wanted: HashSet<Diamond> = built.diamonds.iter().copied().filter(is_seen).collect();
     for d in built.diamonds.iter().rev() {

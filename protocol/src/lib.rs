@@ -10,6 +10,7 @@
 //! | [`points`] | the progressive points of a diamond ⇄ bytes |
 //! | [`rans`] | the entropy coder under [`points`] |
 //! | [`index`] | pages of errors, heights and sizes, from which a client knows the cut |
+//! | [`sight`] | how large an error of heights looks |
 //! | [`message`] | routes, catalogue, batch frames |
 //! | [`zone`] | regions where the viewer stays, and how much of each diamond is seen from there |
 //! | [`wire`] | the one place that knows the serialisation crate |
@@ -26,6 +27,7 @@ pub mod index;
 pub mod message;
 pub mod points;
 pub mod rans;
+pub mod sight;
 pub mod wire;
 pub mod zone;
 

@@ -272,6 +272,9 @@ pub struct StreamView {
     /// `sides=x,y,z;...`: the half spaces that are seen, at most [`SIDES_MAX`], each through the eye and with
     /// this vector pointing inside. What lies wholly beyond one of them is not in view. None: all around.
     pub sides: Vec<[f64; 3]>,
+    /// `vertical=1`: errors of heights count as they are seen, see [`crate::sight`]. `vertical=0`, or nothing: all
+    /// count as spheres.
+    pub vertical: bool,
 }
 
 /// Why parameters do not ask for a stream.
@@ -289,12 +292,12 @@ pub enum StreamError {
     },
     /// Not a parameter.
     #[error(
-        "'{0}' is no parameter of a stream: expected bbox, error, eye, angle, sides, limit, each at most once"
+        "'{0}' is no parameter of a stream: expected bbox, error, eye, angle, sides, vertical, limit, each at most once"
     )]
     Name(String),
     /// Half a view.
     #[error(
-        "eye= and angle= go together, and sides= with them: an order by distance needs all it is made of"
+        "eye= and angle= go together, and sides= and vertical= with them: an order by distance needs all it is made of"
     )]
     View,
 }
@@ -307,8 +310,11 @@ pub fn stream_route(scene: &str, version: &str, layer: &str, ask: &StreamAsk) ->
     if let Some([x0, y0, x1, y1]) = ask.bbox {
         let _ = write!(route, "&bbox={x0},{y0},{x1},{y1}");
     }
-    if let Some(StreamView { eye: [x, y, z], angle, sides }) = &ask.view {
+    if let Some(StreamView { eye: [x, y, z], angle, sides, vertical }) = &ask.view {
         let _ = write!(route, "&eye={x},{y},{z}&angle={angle}");
+        if *vertical {
+            route.push_str("&vertical=1");
+        }
         for (i, [x, y, z]) in sides.iter().enumerate() {
             let _ = write!(route, "{}{x},{y},{z}", if i == 0 { "&sides=" } else { ";" });
         }
@@ -327,7 +333,7 @@ pub fn parse_stream<'a>(
     pairs: impl IntoIterator<Item = (&'a str, &'a str)>,
 ) -> Result<StreamAsk, StreamError> {
     let mut ask = StreamAsk::default();
-    let (mut seen, mut eye, mut angle, mut sides) = (Vec::new(), None, None, None);
+    let (mut seen, mut eye, mut angle, mut sides, mut vertical) = (Vec::new(), None, None, None, None);
     for (name, text) in pairs {
         let fail = |name, expected| StreamError::Value { name, found: excerpt(text), expected };
         if seen.contains(&name) {
@@ -358,12 +364,25 @@ pub fn parse_stream<'a>(
                 let expected = "at most 8 vectors x,y,z;x,y,z;... that point inside";
                 sides = Some(vectors(text).ok_or_else(|| fail("sides", expected))?);
             }
+            "vertical" => {
+                let expected = "0 or 1";
+                vertical = Some(match text {
+                    "0" => false,
+                    "1" => true,
+                    _ => return Err(fail("vertical", expected)),
+                });
+            }
             _ => return Err(StreamError::Name(excerpt(name))),
         }
     }
-    ask.view = match (eye, angle, sides) {
-        (Some(eye), Some(angle), sides) => Some(StreamView { eye, angle, sides: sides.unwrap_or_default() }),
-        (None, None, None) => None,
+    ask.view = match (eye, angle, sides, vertical) {
+        (Some(eye), Some(angle), sides, vertical) => Some(StreamView {
+            eye,
+            angle,
+            sides: sides.unwrap_or_default(),
+            vertical: vertical.unwrap_or(false),
+        }),
+        (None, None, None, None) => None,
         _ => return Err(StreamError::View),
     };
     Ok(ask)
@@ -561,8 +580,8 @@ mod tests {
         let direction = direction.prop_filter("a direction", |v| v.iter().any(|x| *x != 0.0));
         let sides = prop::collection::vec(direction, 0..=SIDES_MAX);
         let positive = any_number().prop_map(f64::abs).prop_filter("above 0", |x| *x > 0.0);
-        let view = ([any_number(), any_number(), any_number()], positive, sides);
-        let view = view.prop_map(|(eye, angle, sides)| StreamView { eye, angle, sides });
+        let view = ([any_number(), any_number(), any_number()], positive, sides, any::<bool>());
+        let view = view.prop_map(|(eye, angle, sides, vertical)| StreamView { eye, angle, sides, vertical });
         let bbox = [any_number(), any_number(), any_number(), any_number()];
         let bbox = bbox.prop_map(|[a, b, c, d]| [a.min(c), b.min(d), a.max(c), b.max(d)]);
         let parts = (
@@ -598,6 +617,8 @@ mod tests {
             ("eye=1,2&angle=1", "x,y,z in metres"),
             ("eye=1,2,3&angle=1&sides=0,0,0", "point inside"),
             ("sides=1,0,0", "go together"),
+            ("vertical=1", "go together"),
+            ("eye=1,2,3&angle=1&vertical=yes", "vertical=yes: expected 0 or 1"),
             ("eror=1", "'eror' is no parameter"),
         ] {
             let error = parse_stream(pairs(text)).unwrap_err().to_string();

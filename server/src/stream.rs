@@ -19,6 +19,7 @@ use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::{self, Entry};
 use diamantina_protocol::message::{self, FrameHeader, Layer, StreamAsk};
+use diamantina_protocol::sight::{is_vertical, vertical_angle};
 use std::cmp::Ordering;
 use std::collections::{BinaryHeap, HashMap, HashSet, VecDeque};
 use std::sync::Arc;
@@ -202,6 +203,10 @@ impl Stream {
             return None;
         }
         let Some(view) = &self.ask.view else { return Some(error) };
+        let mut apparent_max = f64::INFINITY;
+        if view.vertical && is_vertical(&self.forest, d.level(), entry.error_metres, layer.cell) {
+            apparent_max = vertical_angle(view.eye, error, low, high);
+        }
         let from_eye = |corner: [f64; 3]| [0, 1, 2].map(|i| corner[i] - view.eye[i]);
         let (low, high) = (from_eye(low), from_eye(high));
         let beyond = |side: &[f64; 3]| {
@@ -212,7 +217,7 @@ impl Stream {
             return None;
         }
         let distance2: f64 = (0..3).map(|i| low[i].max(-high[i]).max(0.0).powi(2)).sum();
-        let apparent = if error > 0.0 { error / distance2.sqrt() } else { 0.0 };
+        let apparent = if error > 0.0 { (error / distance2.sqrt()).min(apparent_max) } else { 0.0 };
         (apparent > view.angle).then_some(apparent)
     }
 }
