@@ -565,7 +565,9 @@ fn a_second_build_into_a_store_is_told_to_wait() {
     let folder = scratch.path();
     std::fs::create_dir(folder.join("disk")).unwrap();
     old_scene(folder);
-    let first = start(&programs().server, &words(folder, "build {}/new.tif -o {}/disk/store --scene keep"));
+    // Large enough that it is not done before it is held still, however busy the machine.
+    sample::write(&folder.join("large.tif"), 3000).unwrap();
+    let first = start(&programs().server, &words(folder, "build {}/large.tif -o {}/disk/store --scene keep"));
     let started = Instant::now();
     while !folder.join("disk/store/.building").exists() {
         assert!(started.elapsed() < PATIENCE, "the first build never starts");
