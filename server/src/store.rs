@@ -337,7 +337,7 @@ impl Writer {
     /// [`Writer::clear`] or the end.
     ///
     /// # Errors
-    /// When another build is at work there or the folder cannot be written.
+    /// When another program is at work there or the folder cannot be written.
     pub fn create(root: &Path) -> Result<Self, StoreError> {
         if let Some(found) = foreign(root) {
             return Err(StoreError::Foreign { path: root.to_owned(), found });
