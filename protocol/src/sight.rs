@@ -30,11 +30,15 @@ pub fn vertical_angle(eye: [f64; 3], error: f64, low: [f64; 3], high: [f64; 3]) 
     if squares > 0.0 { error * away / squares } else { f64::INFINITY }
 }
 
-/// Whether a declared error, of what triangles of a level draw, is of heights alone: where outlines differ it holds
-/// the length of a hypotenuse. `cell`: metres of a lattice step along x and y.
+/// Whether a declared error, of what triangles of a level draw, is of heights alone, and so are all below it: where
+/// outlines differ an error holds the length of a hypotenuse, and the least is that of the finest level. `cell`: metres
+/// of a lattice step along x and y.
+///
+/// The same length for all levels, so that what is split never looks worse than before: its children's errors are
+/// no larger, and so of heights, too.
 #[must_use]
 pub fn is_vertical(forest: &Forest, level: u32, error_metres: f32, cell: [f64; 2]) -> bool {
-    level >= forest.levels() || f64::from(error_metres) < forest.hypotenuse(level, cell)
+    level >= forest.levels() || f64::from(error_metres) < forest.hypotenuse(forest.levels(), cell)
 }
 
 #[cfg(test)]
@@ -76,10 +80,11 @@ mod tests {
     #[test]
     fn an_error_below_a_hypotenuse_is_of_heights() {
         let forest = Forest::covering(1025, 1025, 6).unwrap();
-        let longest = forest.hypotenuse(3, [30.0, 20.0]);
+        let least = forest.hypotenuse(forest.levels(), [30.0, 20.0]);
+        assert!((0..forest.levels()).all(|level| forest.hypotenuse(level, [30.0, 20.0]) >= least));
         #[allow(clippy::cast_possible_truncation, reason = "metres")]
         let of = |metres: f64| is_vertical(&forest, 3, metres as f32, [30.0, 20.0]);
-        assert!(of(longest * 0.99) && !of(longest));
+        assert!(of(least * 0.99) && !of(least));
         assert!(is_vertical(&forest, forest.levels(), f32::MAX, [30.0, 20.0]), "there are no finer outlines");
     }
 }
