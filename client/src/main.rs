@@ -49,8 +49,8 @@ struct ViewArgs {
     /// count for less seen from above, where they hardly show
     #[arg(long)]
     sphere_error: bool,
-    /// How many times --error-pixels an error may reach at the picture's corners; 1 in the middle, and in between
-    /// in between
+    /// How many times as large as in the middle of the picture an error may look at its corners; 1: the same
+    /// everywhere
     #[arg(long, default_value_t = 1.0, value_name = "TIMES")]
     foveation: f64,
     /// How diamonds are encoded
@@ -378,7 +378,10 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
         return Err(Failure(2, format!("--fps {}: expected 0 or more", args.fps)));
     }
     let patience = args.settle.map(Duration::try_from_secs_f64).transpose();
-    let patience = patience.map_err(|_| Failure(2, "--settle: expected seconds, 0 or more".to_owned()))?;
+    let patience = patience.map_err(|_| {
+        let found = args.settle.unwrap_or_default();
+        Failure(2, format!("--settle {found}: expected seconds, 0 or more"))
+    })?;
     if !(0.0..=morph::SECONDS_MAX).contains(&args.morph) {
         let max = morph::SECONDS_MAX;
         return Err(Failure(2, format!("--morph {}: expected seconds from 0 to {max}", args.morph)));

@@ -416,7 +416,7 @@ struct Parent<'a> {
 #[derive(Clone, Copy)]
 struct Before {
     height: i32,
-    slope: [f32; 2],
+    normal: [i16; 2],
     record: Option<Record>,
 }
 
@@ -474,13 +474,13 @@ impl Start<'_> {
 
     /// What the parents have of each slot.
     fn before(&self) -> Vec<Before> {
-        let nothing = Before { height: NODATA, slope: [0.0; 2], record: None };
+        let nothing = Before { height: NODATA, normal: [0; 2], record: None };
         let mut before = vec![nothing; self.surface.block().heights().len()];
         for parent in self.parents {
             let (heights, slopes) = (parent.surface.block().heights(), parent.surface.slopes());
             walk_shared(self.forest, self.d, parent.diamond, |to, from| {
                 let record = parent.motion.map(|motion| motion.records[from]);
-                before[to] = Before { height: heights[from], slope: slopes[from], record };
+                before[to] = Before { height: heights[from], normal: normal(slopes[from]), record };
             });
         }
         before
@@ -496,14 +496,14 @@ impl Start<'_> {
         let n = self.surface.block().segments();
         let own = self.surface.block().heights()[Block::slot(n, p, q)];
         let place = |slot: usize| -> Option<Place> {
-            let Before { height, slope, record } = before[slot];
+            let Before { height, normal, record } = before[slot];
             if height == NODATA {
                 return None;
             }
             let above = (height - own) as f32;
             match record.filter(|_| at_once).map(|record| self.drawn(&record)) {
                 Some((lift, normal)) => Some((above + lift, normal)),
-                None => Some((above, normal(slope))),
+                None => Some((above, normal)),
             }
         };
         if p.is_multiple_of(2) || !self.forest.adds_points(self.d.level()) {

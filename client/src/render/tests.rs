@@ -13,7 +13,7 @@ use super::*;
 use crate::camera::FOV_Y;
 use crate::drawing::Moving;
 use crate::morph::{self, Change, Moment, Morphs, Sight};
-use crate::picture::{Picture, write_png};
+use crate::picture::Picture;
 use crate::surface::Surface;
 use crate::world::{Dice, Ground};
 use diamantina_protocol::NODATA;
@@ -182,7 +182,7 @@ fn pixel_of(camera: &Camera, p: DVec3) -> [f64; 2] {
 }
 
 /// Smooth noise of about 0 to 1: values at whole numbers, interpolated, in octaves.
-fn noise(x: f64, y: f64, octaves: u32, ridged: bool) -> f64 {
+fn noise(x: f64, y: f64, octaves: u32) -> f64 {
     let value = |i: i64, j: i64, k: u32| {
         let mut h =
             (i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ (j as u64).wrapping_mul(0xc2b2_ae3d_27d4_eb4f);
@@ -192,7 +192,6 @@ fn noise(x: f64, y: f64, octaves: u32, ridged: bool) -> f64 {
         (h >> 11) as f64 / (1u64 << 53) as f64
     };
     let (mut sum, mut weight, mut scale, mut total) = (0.0, 1.0, 1.0, 0.0);
-    let mut gain = 1.0;
     for k in 0..octaves {
         let (x, y) = (x * scale + f64::from(k) * 17.3, y * scale + f64::from(k) * 9.1);
         let (i, j) = (x.floor(), y.floor());
@@ -201,11 +200,8 @@ fn noise(x: f64, y: f64, octaves: u32, ridged: bool) -> f64 {
         let at = |di: i64, dj: i64| value(i as i64 + di, j as i64 + dj, k);
         let low = at(0, 0) + (at(1, 0) - at(0, 0)) * s;
         let high = at(0, 1) + (at(1, 1) - at(0, 1)) * s;
-        let plain = low + (high - low) * t;
-        let octave = if ridged { (1.0 - (2.0 * plain - 1.0).abs()).powi(2) } else { plain };
-        sum += octave * weight * gain;
+        sum += (low + (high - low) * t) * weight;
         total += weight;
-        gain = if ridged { (octave * 1.6).clamp(0.25, 1.0) } else { 1.0 };
         weight *= 0.5;
         scale *= 2.03;
     }
@@ -213,7 +209,7 @@ fn noise(x: f64, y: f64, octaves: u32, ridged: bool) -> f64 {
 }
 
 fn rough(x: u32, y: u32) -> i32 {
-    (noise(f64::from(x) / 13.0, f64::from(y) / 13.0, 4, false) * 4000.0) as i32
+    (noise(f64::from(x) / 13.0, f64::from(y) / 13.0, 4) * 4000.0) as i32
 }
 
 #[test]
@@ -436,54 +432,4 @@ fn runs_join_neighbouring_sides() {
     assert_eq!(found(0b1011), [[0, 6], [9, 12]]);
     assert_eq!(found(0b0101), [[0, 3], [6, 9]]);
     assert!(found(0).is_empty());
-}
-
-/// Not a check but a look: `cargo test -p diamantina-client mountains -- --ignored`, then open the
-/// pictures in the temporary folder. Prints what a frame costs.
-#[test]
-#[ignore = "writes pictures for a person to judge"]
-#[allow(clippy::print_stdout, reason = "its output is for a person")]
-fn mountains_look_like_mountains() {
-    let forest = Forest::new(10, 6, [1, 1]).unwrap();
-    let height = |x: u32, y: u32| {
-        let (x, y) = (f64::from(x) / 330.0, f64::from(y) / 330.0);
-        let base = noise(x * 0.7 + 3.0, y * 0.7 + 1.0, 3, false);
-        let ridges = noise(x + 0.3 * base, y, 9, true);
-        ((ridges * (base - 0.15).max(0.02) * 9000.0 - 250.0) * 10.0) as i32
-    };
-    let world = World::new(forest, 30.0, height);
-    let layers = std::slice::from_ref(&world.layer);
-    let size = [1380, 768];
-    let above = world.overhead(size);
-    let oblique = Camera {
-        eye: world.place(0.5, -0.12, 6500.0),
-        target: world.place(0.5, 0.45, 600.0),
-        fov_y: FOV_Y,
-        size,
-    };
-    let low =
-        Camera { eye: world.place(0.35, 0.2, 2400.0), target: world.place(0.62, 0.6, 1500.0), ..oblique };
-    println!("heights {:?}", world.layer.heights);
-    for (samples, level) in [(4, 8), (1, 8), (1, 7), (1, 5)] {
-        let mut offscreen = offscreen(samples, 1 << 30);
-        let items = world.level(level);
-        for (name, camera) in [("above", &above), ("oblique", &oblique), ("low", &low)] {
-            for show_levels in [false, true].into_iter().take(if level == 8 { 2 } else { 1 }) {
-                let look = Look { show_levels, ..Look::default() };
-                let mut frame = || {
-                    let start = std::time::Instant::now();
-                    let stats = offscreen.draw(layers, camera, &items, &look).unwrap();
-                    let encoded = start.elapsed();
-                    let picture = offscreen.read().unwrap();
-                    (start.elapsed(), encoded, stats, picture)
-                };
-                let frames = (0..8).map(|_| frame());
-                let (whole, encoded, stats, picture) = frames.min_by_key(|f| f.0).unwrap();
-                println!("{name} {samples} samples: {whole:?}, {encoded:?} of it encoding, {stats:?}");
-                let file = format!("diamantina-{name}-{samples}-{level}-{show_levels}.png");
-                let file = std::fs::File::create(std::env::temp_dir().join(file)).unwrap();
-                write_png(&picture, file).unwrap();
-            }
-        }
-    }
 }

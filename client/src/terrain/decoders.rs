@@ -1,0 +1,174 @@
+//! Threads that decode payloads whose parents are there, and hold the others.
+
+use super::DONE_MAX;
+use crate::cache::Key;
+use crate::surface::Surface;
+use bytes::Bytes;
+use diamantina_protocol::diamond::Diamond;
+use diamantina_protocol::message::Scene;
+use diamantina_protocol::points::DecodeError;
+use foldhash::fast::RandomState;
+use std::collections::{HashMap, VecDeque};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+
+/// A payload with its parents' surfaces, as far as they are there.
+#[derive(Debug)]
+pub(super) struct Job {
+    pub(super) payload: Bytes,
+    pub(super) parents: Vec<(Diamond, Option<Arc<Surface>>)>,
+}
+
+impl Job {
+    fn is_ready(&self) -> bool {
+        self.parents.iter().all(|(_, surface)| surface.is_some())
+    }
+}
+
+pub(super) type Decoded = (Key, Result<Arc<Surface>, DecodeError>);
+
+/// Threads that decode payloads whose parents are there, and hold the others.
+#[derive(Debug)]
+pub(super) struct Decoders {
+    shared: Arc<Bench>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+#[derive(Debug)]
+struct Bench {
+    scene: Arc<Scene>,
+    state: Mutex<Jobs>,
+    changed: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct Jobs {
+    /// Without all their parents. Bounded with `ready` by [`super::HELD_BYTES_MAX`] and the ideal cut.
+    held: HashMap<Key, Job, RandomState>,
+    ready: VecDeque<(Key, Job)>,
+    /// What no frame has taken yet, in the order of decoding, so parents before children.
+    done: Vec<Decoded>,
+    fresh: HashMap<Key, Arc<Surface>, RandomState>,
+    running: usize,
+    closed: bool,
+}
+
+impl Decoders {
+    pub(super) fn start(scene: &Arc<Scene>) -> std::io::Result<Self> {
+        let shared =
+            Arc::new(Bench { scene: Arc::clone(scene), state: Mutex::default(), changed: Condvar::new() });
+        let count = std::thread::available_parallelism()?.get();
+        let mut decoders = Self { shared, threads: Vec::with_capacity(count) };
+        for _ in 0..count {
+            let bench = Arc::clone(&decoders.shared);
+            let thread = std::thread::Builder::new().name("diamantina-decode".into());
+            decoders.threads.push(thread.spawn(move || bench.work())?);
+        }
+        Ok(decoders)
+    }
+
+    pub(super) fn submit(&self, key: Key, mut job: Job) {
+        let mut jobs = self.shared.lock();
+        for (parent, surface) in job.parents.iter_mut().filter(|(_, surface)| surface.is_none()) {
+            *surface = jobs.fresh.get(&(key.0, *parent)).cloned();
+        }
+        if job.is_ready() {
+            jobs.ready.push_back((key, job));
+            self.shared.changed.notify_one();
+        } else {
+            jobs.held.insert(key, job);
+        }
+    }
+
+    /// What has been decoded since the last call, parents before children.
+    pub(super) fn take(&self) -> Vec<Decoded> {
+        let mut jobs = self.shared.lock();
+        jobs.fresh.clear();
+        if jobs.done.len() >= DONE_MAX {
+            self.shared.changed.notify_all();
+        }
+        std::mem::take(&mut jobs.done)
+    }
+
+    /// Whether nothing is being decoded, about to be, or left to take.
+    pub(super) fn is_idle(&self) -> bool {
+        let jobs = self.shared.lock();
+        jobs.ready.is_empty() && jobs.running == 0 && jobs.done.is_empty()
+    }
+
+    /// Drops what has not been begun and need not be kept; tells what it was.
+    pub(super) fn forget(&self, keep: impl Fn(Key) -> bool) -> Vec<Key> {
+        let mut jobs = self.shared.lock();
+        let mut forgotten = Vec::new();
+        let mut keep = |key: Key| {
+            let keep = keep(key);
+            if !keep {
+                forgotten.push(key);
+            }
+            keep
+        };
+        jobs.held.retain(|key, _| keep(*key));
+        jobs.ready.retain(|(key, _)| keep(*key));
+        forgotten
+    }
+}
+
+impl Drop for Decoders {
+    fn drop(&mut self) {
+        self.shared.lock().closed = true;
+        self.shared.changed.notify_all();
+        for thread in self.threads.drain(..) {
+            // A thread that panicked has said so already.
+            let _ = thread.join();
+        }
+    }
+}
+
+impl Bench {
+    fn lock(&self) -> MutexGuard<'_, Jobs> {
+        // The jobs are whole between any two statements, whoever panicked.
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn work(&self) {
+        let mut jobs = self.lock();
+        while !jobs.closed {
+            let job = if jobs.done.len() < DONE_MAX { jobs.ready.pop_front() } else { None };
+            let Some((key, job)) = job else {
+                jobs = self.changed.wait(jobs).unwrap_or_else(PoisonError::into_inner);
+                continue;
+            };
+            jobs.running += 1;
+            drop(jobs);
+            let (layer, d) = key;
+            let parents: Vec<(Diamond, &Surface)> =
+                job.parents.iter().filter_map(|(parent, s)| Some((*parent, s.as_deref()?))).collect();
+            let layer_of = &self.scene.layers[layer];
+            let result = Surface::split(layer_of, d, &parents, &job.payload).map(Arc::new);
+            drop(job);
+            jobs = self.lock();
+            jobs.running -= 1;
+            if let Ok(surface) = &result {
+                jobs.fresh.insert(key, Arc::clone(surface));
+                for child in layer_of.forest.children(d).into_iter().flatten() {
+                    self.release(&mut jobs, (layer, child), d, surface);
+                }
+            }
+            jobs.done.push((key, result));
+        }
+    }
+
+    /// Gives a parent to a held child, which may be all that it waits for.
+    fn release(&self, jobs: &mut Jobs, child: Key, parent: Diamond, surface: &Arc<Surface>) {
+        let Some(job) = jobs.held.get_mut(&child) else { return };
+        for (_, slot) in job.parents.iter_mut().filter(|(p, _)| *p == parent) {
+            *slot = Some(Arc::clone(surface));
+        }
+        if job.is_ready()
+            && let Some(job) = jobs.held.remove(&child)
+        {
+            jobs.ready.push_back((child, job));
+            self.changed.notify_one();
+        }
+    }
+}

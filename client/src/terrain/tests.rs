@@ -1,0 +1,395 @@
+//! A scene streamed from a made server, frame by frame.
+
+use super::*;
+use crate::world::{Dice, Faults, Ground, Served, above, any_camera, world};
+
+const MINUTE: Duration = Duration::from_secs(60);
+
+fn open(served: &Served, options: Options) -> Terrain {
+    Terrain::open(&served.url, options).unwrap()
+}
+
+#[test]
+fn settling_reaches_the_asked_error_in_few_round_trips() {
+    for layers in [1, 2] {
+        let served = Served::start(layers, Faults::default());
+        let mut terrain = open(&served, Options::default());
+        let camera = above();
+        let view = terrain.settle(&camera, MINUTE);
+        assert!(view.complete && view.error_pixels <= 1.0, "{view:?}");
+        assert_eq!(view.error_pixels, view.error_pixels_goal);
+        let stats = view.stats;
+        println!("{layers} layers: {stats:?}");
+        // Scene, roots with their pages, deeper pages, the rest. On a busy machine one wave of requests may
+        // be answered before its last is sent, and count as two: so the best of a few tries.
+        let tries = (0..5).map(|_| open(&served, Options::default()).settle(&camera, MINUTE));
+        let mut trips = tries.map(|v| v.stats.traffic.round_trips);
+        assert!(stats.traffic.round_trips <= 4 || trips.any(|t| t <= 4), "{stats:?}");
+        assert!(stats.traffic.errors == 0 && stats.failed == 0 && stats.decoding == 0);
+        assert!(stats.points_real > 0 && stats.points_fictitious > 0);
+        assert!(stats.first_picture_seconds <= stats.asked_error_seconds);
+        assert_eq!(view.items.iter().map(|item| item.layer).max(), Some(layers - 1));
+        // Nothing moves, so nothing more is asked for.
+        let again = terrain.frame(&camera);
+        assert_eq!(again.stats.traffic.requests, stats.traffic.requests);
+    }
+}
+
+#[test]
+fn a_stream_shows_a_view_in_one_round_trip_and_leaves_nothing_to_wish_for() {
+    for layers in [1, 2] {
+        let served = Served::start(layers, Faults::default());
+        let usual = open(&served, Options::default()).settle(&above(), MINUTE);
+        let mut terrain = open(&served, Options::default());
+        terrain.stream(&above());
+        let view = terrain.settle(&above(), MINUTE);
+        assert!(view.complete && view.error_pixels <= 1.0);
+        assert_eq!((view.error_pixels, view.items.len()), (usual.error_pixels, usual.items.len()));
+        let traffic = view.stats.traffic;
+        println!("{layers} layers: {traffic:?}, without a stream {:?}", usual.stats.traffic);
+        assert_eq!(traffic.requests, 1 + layers as u64, "the scene, and a stream a layer");
+        assert_eq!(traffic.errors + traffic.cancelled, 0);
+        assert!(traffic.round_trips <= 1 + layers as u64);
+    }
+}
+
+#[test]
+fn a_stream_is_drawn_while_it_comes_and_gets_better() {
+    let served = Served::start(1, Faults { slow: 1.0, ..Faults::default() });
+    let mut terrain = open(&served, Options::default());
+    terrain.stream(&above());
+    let (until, mut last, mut pictures) = (Instant::now() + MINUTE, f64::INFINITY, 0);
+    while Instant::now() < until {
+        let view = terrain.frame(&above());
+        assert!(view.error_pixels <= last, "a still camera's picture never gets worse");
+        pictures += usize::from(view.error_pixels < last);
+        last = view.error_pixels;
+        if view.complete {
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(3));
+    }
+    println!("{pictures} pictures, each with less error");
+    assert!(last <= 1.0 && pictures > 5);
+    assert_eq!(terrain.frame(&above()).stats.traffic.requests, 2);
+}
+
+#[test]
+fn a_stream_that_fails_is_endured_and_the_rest_is_wished_for() {
+    let faults = [
+        Faults { status_500: 1.0, ..Faults::default() },
+        Faults { truncated: 1.0, ..Faults::default() },
+        Faults { damaged: 0.1, ..Faults::default() },
+        Faults { silent: 1.0, ..Faults::default() },
+        Faults { absurd: 0.1, ..Faults::default() },
+        Faults { garbage: 1.0, ..Faults::default() },
+        Faults { bomb: 1.0, ..Faults::default() },
+        Faults { unasked: 0.02, ..Faults::default() },
+        Faults { endless: 1.0, ..Faults::default() },
+    ];
+    for fault in faults {
+        let served = Served::start(2, Faults { streams_alone: true, ..fault });
+        let patience = Duration::from_millis(500);
+        let fetch = fetch::Options { patience, ..fetch::Options::default() };
+        let mut terrain = open(&served, Options { fetch, ..Options::default() });
+        terrain.stream(&above());
+        let view = terrain.settle(&above(), MINUTE);
+        println!("{fault:?}: {:?}", view.stats.traffic);
+        assert!(view.complete && view.error_pixels <= 1.0, "{fault:?}: {:?}", terrain.problem());
+        assert!(view.stats.traffic.errors + view.stats.traffic.cancelled > 0, "{fault:?} did nothing");
+        // What arrived before is not fetched again.
+        let whole: usize = world()[..2].iter().flat_map(|b| b.payloads.values()).map(Vec::len).sum();
+        assert!(fault.truncated == 0.0 || view.stats.traffic.bytes < 2 * whole as u64);
+    }
+}
+
+#[test]
+fn a_stream_of_a_scene_that_is_gone_is_noticed() {
+    let served = Served::start(1, Faults::default());
+    let mut terrain = open(&served, Options::default());
+    served.misbehave(Faults { gone: true, ..Faults::default() });
+    terrain.stream(&above());
+    let view = terrain.settle(&above(), MINUTE);
+    assert!(terrain.scene_changed() && !view.complete);
+}
+
+#[test]
+fn a_stream_for_a_view_that_moved_away_or_that_memory_cannot_hold_is_dropped() {
+    let served = Served::start(1, Faults { slow: 1.0, ..Faults::default() });
+    let memory_bytes = 100 * Surface::bytes(&world()[0].layer.forest, 0);
+    let mut terrain = open(&served, Options { memory_bytes, ..Options::default() });
+    terrain.stream(&above());
+    let view = terrain.settle(&above(), MINUTE);
+    assert!(view.complete && view.error_pixels == view.error_pixels_goal);
+    assert!(view.stats.resident_bytes <= memory_bytes);
+    let mut terrain = open(&served, Options { tolerance_pixels: 0.2, ..Options::default() });
+    terrain.stream(&above());
+    let away = Camera { target: above().eye + DVec3::Z, ..above() };
+    let until = Instant::now() + MINUTE;
+    while terrain.fetcher.is_streaming() && Instant::now() < until {
+        terrain.frame(&away);
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    assert_eq!(terrain.frame(&away).stats.traffic.cancelled, 1);
+}
+
+#[test]
+fn a_stream_waits_for_frames_that_do_not_come() {
+    let served = Served::start(1, Faults { heavy: true, ..Faults::default() });
+    let mut terrain = open(&served, Options::default());
+    terrain.stream(&above());
+    // Until nothing more arrives.
+    let mut last = (0, Instant::now());
+    while last.1.elapsed() < Duration::from_millis(500) {
+        let bytes = terrain.fetcher.traffic().bytes;
+        if bytes != last.0 {
+            last = (bytes, Instant::now());
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    println!("{} bytes, then it waits", last.0);
+    // Pages of the index take more while they wait than they did on the wire.
+    assert!(last.0 > 7 << 19 && last.0 < 8 << 20, "{}", last.0);
+    assert!(terrain.fetcher.is_streaming());
+}
+
+#[test]
+fn from_the_first_picture_on_something_is_always_drawn_and_it_gets_better() {
+    let served = Served::start(2, Faults { slow: 0.5, ..Faults::default() });
+    let mut terrain = open(&served, Options::default());
+    let camera = above();
+    let until = Instant::now() + MINUTE;
+    let mut last = f64::INFINITY;
+    let mut pictures = 0;
+    while Instant::now() < until {
+        let view = terrain.frame(&camera);
+        assert!(view.error_pixels <= last, "a still camera's picture never gets worse");
+        assert!(view.error_pixels.is_finite() || pictures == 0);
+        pictures += usize::from(view.error_pixels < last);
+        last = view.error_pixels;
+        if view.complete {
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(3));
+    }
+    println!("{pictures} pictures, each with less error");
+    assert!(last <= 1.0 && pictures > 2);
+}
+
+#[test]
+fn a_flight_in_little_memory_stays_within_it_and_never_shows_nothing() {
+    let served = Served::start(1, Faults::default());
+    let memory_bytes = 400 * Surface::bytes(&world()[0].layer.forest, 0);
+    let mut terrain = open(&served, Options { memory_bytes, ..Options::default() });
+    terrain.settle(&above(), MINUTE);
+    let mut dice = Dice(5);
+    for _ in 0..25 {
+        let (from, to) = (any_camera(&mut dice), any_camera(&mut dice));
+        for step in 0..20 {
+            let eye = from.eye.lerp(to.eye, f64::from(step) / 20.0);
+            let target = DVec3::new(505_000.0, 4_002_000.0, 100.0);
+            let view = terrain.frame(&Camera { eye, target, ..from });
+            assert!(!view.items.is_empty());
+            assert!(view.stats.resident_bytes <= memory_bytes);
+            assert!(view.stats.frame_seconds < 0.05, "{}", view.stats.frame_seconds);
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+    let view = terrain.settle(&above(), MINUTE);
+    assert!(view.complete && view.stats.splits_drawn <= 300);
+    assert_eq!(view.error_pixels, view.error_pixels_goal, "the best that the memory allows");
+}
+
+/// Streams from a server that misbehaves; the view at the end, and the longest frame.
+fn endure(faults: Faults, seconds: u64) -> (FrameView, f64, Option<String>) {
+    let served = Served::start(2, faults);
+    let patience = Duration::from_millis(500);
+    let fetch = fetch::Options { patience, ..fetch::Options::default() };
+    let mut terrain = open(&served, Options { fetch, ..Options::default() });
+    let until = Instant::now() + Duration::from_secs(seconds);
+    let mut longest = 0.0f64;
+    loop {
+        let started = Instant::now();
+        let view = terrain.frame(&above());
+        longest = longest.max(started.elapsed().as_secs_f64());
+        if view.complete || Instant::now() > until {
+            println!("{faults:?}: {:.1} ms at most, {:?}", longest * 1e3, view.stats.traffic);
+            return (view, longest, terrain.problem().map(str::to_owned));
+        }
+        std::thread::sleep(Duration::from_millis(3));
+    }
+}
+
+#[test]
+fn a_server_that_misbehaves_now_and_then_is_endured_without_a_slow_frame() {
+    let some = 0.25;
+    let faults = [
+        Faults { status_500: some, ..Faults::default() },
+        Faults { truncated: some, ..Faults::default() },
+        Faults { damaged: some / 5.0, ..Faults::default() },
+        Faults { silent: some, ..Faults::default() },
+        Faults { absurd: some / 20.0, ..Faults::default() },
+        Faults { garbage: some, ..Faults::default() },
+        Faults { bomb: some, ..Faults::default() },
+    ];
+    std::thread::scope(|scope| {
+        for faults in faults {
+            scope.spawn(move || {
+                // Room for wishes that were unlucky five times and rest.
+                let (view, longest, problem) = endure(faults, 60);
+                assert!(view.complete && view.error_pixels <= 1.0, "{faults:?} {problem:?}");
+                assert!(longest < 0.05, "{longest} s {faults:?}");
+            });
+        }
+    });
+}
+
+#[test]
+fn a_server_that_always_misbehaves_is_reported_without_a_slow_frame() {
+    let faults = [
+        Faults { status_500: 1.0, ..Faults::default() },
+        Faults { damaged: 1.0, ..Faults::default() },
+        Faults { garbage: 1.0, ..Faults::default() },
+        Faults { bomb: 1.0, ..Faults::default() },
+        Faults { silent: 1.0, ..Faults::default() },
+    ];
+    std::thread::scope(|scope| {
+        for faults in faults {
+            scope.spawn(move || {
+                let (view, longest, problem) = endure(faults, 9);
+                assert!(!view.complete && view.stats.failed > 0 && problem.is_some(), "{faults:?}");
+                assert!(longest < 0.05, "{longest} s {faults:?}");
+                assert_eq!(view.items.is_empty(), faults.bomb == 0.0, "roots alone make a picture");
+            });
+        }
+    });
+}
+
+#[test]
+fn settling_ends_early_where_nothing_more_can_come() {
+    let served = Served::start(1, Faults { status_500: 0.0, ..Faults::default() });
+    let mut terrain = open(&served, Options::default());
+    served.misbehave(Faults { status_500: 1.0, ..Faults::default() });
+    let started = Instant::now();
+    let view = terrain.settle(&above(), MINUTE);
+    assert!(!view.complete && started.elapsed() < Duration::from_secs(15));
+    assert!(terrain.problem().unwrap().contains("500"));
+}
+
+#[test]
+fn a_new_version_of_the_scene_is_noticed_and_the_picture_stays() {
+    let served = Served::start(1, Faults::default());
+    let mut terrain = open(&served, Options { tolerance_pixels: 20.0, ..Options::default() });
+    let view = terrain.settle(&above(), MINUTE);
+    assert!(view.complete && !terrain.scene_changed());
+    served.misbehave(Faults { gone: true, ..Faults::default() });
+    terrain.set_tolerance_pixels(1.0);
+    let view = terrain.settle(&above(), MINUTE);
+    assert!(terrain.scene_changed() && !view.items.is_empty() && !view.complete);
+}
+
+/// Lattice points of the terrain, far from what has no data.
+fn places() -> impl Iterator<Item = [i64; 2]> {
+    (20..470).step_by(5).flat_map(|y| (440..750).step_by(5).map(move |x| [x, y]))
+}
+
+/// Flies in and out again above resident data. The largest change of a height from one frame to the next, in
+/// metres, and the number of frames in which something moved.
+fn largest_step(morph_seconds: f64) -> (f64, usize) {
+    let served = Served::start(1, Faults::default());
+    let mut terrain = open(&served, Options { tolerance_pixels: 4.0, ..Options::default() });
+    let low = above().target + DVec3::new(0.0, -1500.0, 1800.0);
+    // In, a rest, and out.
+    let camera = |frame: i32| {
+        let part = (f64::from(frame) / 25.0).min(1.0).min(f64::from(75 - frame) / 25.0);
+        Camera { eye: above().eye.lerp(low, part), ..above() }
+    };
+    for frame in 0..=25 {
+        assert!(terrain.settle(&camera(frame), MINUTE).complete);
+    }
+    // All is there: the same frames, with motions and without.
+    terrain.layers[0].morphs = Morphs::new(morph_seconds);
+    terrain.planes = None;
+    let layer = terrain.scene.layers[0].clone();
+    let (mut last, mut most, mut moving) = (None::<Vec<f64>>, 0.0f64, 0);
+    for frame in 0..=75 {
+        let camera = camera(frame);
+        let view = terrain.frame_at(&camera, 1000.0 + f64::from(frame) / 60.0);
+        let planes = camera.planes();
+        moving += usize::from(view.moving > 0);
+        assert!(
+            view.complete && view.error_pixels.is_finite() && view.error_pixels >= view.error_pixels_goal
+        );
+        assert!(view.stats.frame_seconds < 0.1, "{}", view.stats.frame_seconds);
+        let mut ground = Ground::new(layer.forest, &view.items);
+        let heights: Vec<f64> = places()
+            .map(|p| {
+                let [x, y] = layer.position(p.map(|i| u32::try_from(i).unwrap()));
+                // Items out of view are left out.
+                let sees = planes.iter().all(|s| s.normal.dot(DVec3::new(x, y, 300.0)) + s.offset > 400.0);
+                if sees { ground.height(p).unwrap() * layer.quantum } else { f64::NAN }
+            })
+            .collect();
+        for (a, b) in last.iter().flatten().zip(&heights) {
+            most = most.max((a - b).abs());
+        }
+        last = Some(heights);
+    }
+    (most, moving)
+}
+
+#[test]
+fn a_flight_with_motions_never_jumps() {
+    let (jump, none) = largest_step(0.0);
+    let (step, moving) = largest_step(0.3);
+    println!("{jump:.2} m at once, {step:.2} m in the largest step of motions, which {moving} frames had");
+    assert_eq!(none, 0);
+    // 18 frames a motion, one and a half times as fast in its middle: a twelfth.
+    assert!(jump > 1.0 && step < jump / 10.0 && moving > 40, "{jump} {step} {moving}");
+}
+
+#[test]
+fn what_moves_is_told_counts_as_unsplit_and_is_waited_for() {
+    let served = Served::start(1, Faults::default());
+    let mut terrain =
+        open(&served, Options { morph_seconds: 0.5, tolerance_pixels: 8.0, ..Options::default() });
+    let view = terrain.settle(&above(), MINUTE);
+    assert!(view.complete && view.moving == 0 && view.error_pixels <= 8.0);
+    terrain.set_tolerance_pixels(2.0);
+    let (mut frames, mut last) = (0, view.error_pixels);
+    let until = Instant::now() + MINUTE;
+    let view = loop {
+        let view = terrain.frame(&above());
+        frames += usize::from(view.moving > 0);
+        if view.moving > 0 && view.complete {
+            assert!(view.error_pixels > 2.0, "{}", view.error_pixels);
+        }
+        last = last.max(view.error_pixels);
+        if (view.complete && view.moving == 0) || Instant::now() > until {
+            break view;
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    };
+    println!("{frames} frames with motions, largest error {last:.2} pixels");
+    assert!(frames > 5 && view.complete && view.error_pixels <= 2.0);
+    // What the last frame did not see has nothing to move from.
+    let away = Camera { target: above().eye + DVec3::Z, ..above() };
+    terrain.frame(&away);
+    terrain.set_tolerance_pixels(8.0);
+    let view = terrain.frame(&above());
+    assert_eq!((view.moving, view.complete), (0, true));
+    for morph_seconds in [-1.0, f64::NAN, 61.0] {
+        let options = Options { morph_seconds, ..Options::default() };
+        assert!(matches!(Terrain::open(&served.url, options), Err(TerrainError::Morph(_))));
+    }
+}
+
+#[test]
+fn wrong_options_are_refused() {
+    let served = Served::start(1, Faults::default());
+    let tin = Options { encoding: "tin".into(), ..Options::default() };
+    let error = Terrain::open(&served.url, tin).unwrap_err().to_string();
+    assert!(error.contains("'tin'") && error.contains("points"), "{error}");
+    let zero = Options { tolerance_pixels: 0.0, ..Options::default() };
+    assert!(matches!(Terrain::open(&served.url, zero), Err(TerrainError::Tolerance(_))));
+}
