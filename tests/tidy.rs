@@ -36,9 +36,13 @@ const SERVER: &[(&str, &[&str])] = &[
     ("curve", &["inspect", "store", "stream"]),
     ("http", &["height", "store", "stream"]),
     ("sample", &[]),
-    ("demo", &["hierarchy", "http", "ingest", "progress", "sample"]),
+    ("client_program", &[]),
+    ("demo", &["client_program", "hierarchy", "http", "ingest", "progress", "sample"]),
     ("zone", &["height", "inspect", "progress", "projection", "store"]),
-    ("experiment", &["canvas", "hierarchy", "http", "ingest", "measure", "progress", "simplify"]),
+    (
+        "experiment",
+        &["canvas", "client_program", "hierarchy", "http", "ingest", "measure", "progress", "simplify"],
+    ),
 ];
 
 /// `cut` is a pure function of what it is given; the GPU is `render`'s and the fronts'.

@@ -1,8 +1,6 @@
 //! The harness: synthetic DEM → store → server on a free port → client, and a network that misbehaves.
 
 use diamantina_client::terrain::{self, Terrain};
-use diamantina_protocol::message::Kind;
-use diamantina_protocol::points::Rule;
 use diamantina_server::hierarchy::{self, Report};
 use diamantina_server::http::Server;
 use diamantina_server::progress::Progress;
@@ -101,18 +99,7 @@ pub(crate) fn data() -> Option<PathBuf> {
 
 /// What a build is told unless a test says otherwise.
 pub(crate) fn options() -> hierarchy::Options {
-    hierarchy::Options {
-        scene: "world".to_owned(),
-        layer: "terrain".to_owned(),
-        kind: Kind::Terrain,
-        max_error: 0.0,
-        rule: Rule::Smooth,
-        quantum: None,
-        patch_log2: 6,
-        memory: 2 << 30,
-        fresh: false,
-        checkpoint: hierarchy::CHECKPOINT,
-    }
+    hierarchy::Options::new("world")
 }
 
 /// Writes `width` x `height` floats as a raw DEM and says how to read it. `height` is asked for each sample,

@@ -1,14 +1,13 @@
-//! The two steps of a build that touch every sample again and again: reading windows, measuring errors.
+//! What a build does with every sample: reading the source, reading windows again, measuring errors; and the whole.
 #![allow(clippy::cast_possible_truncation, reason = "heights below 3000 m")]
 
 use criterion::{Criterion, Throughput};
 use diamantina_protocol::bintree::Forest;
-use diamantina_protocol::message::Kind;
-use diamantina_protocol::points::Rule;
 use diamantina_server::canvas::Canvas;
+use diamantina_server::ingest::CrsChoice;
 use diamantina_server::measure::{Nodes, Samples, measure};
 use diamantina_server::progress::Progress;
-use diamantina_server::{hierarchy, ingest};
+use diamantina_server::{hierarchy, ingest, sample};
 use std::collections::HashMap;
 use std::hint::black_box;
 use std::path::Path;
@@ -18,6 +17,32 @@ const SIDE: u32 = 1024;
 fn height(x: u32, y: u32) -> i32 {
     let (x, y) = (f64::from(x), f64::from(y));
     (900.0 * (x / 90.0).sin() * (y / 70.0).cos() + 40.0 * (x / 3.0).cos() + 2000.0) as i32
+}
+
+/// The source, as it is and interpolated to another system, in windows of 512 samples.
+fn read(criterion: &mut Criterion, folder: &Path) {
+    let dem = folder.join("dem.tif");
+    sample::write(&dem, SIDE + 1).expect("a disk with room");
+    let mut group = criterion.benchmark_group("read");
+    for (name, crs) in [("as_it_is", CrsChoice::Source), ("reprojected", CrsChoice::Epsg(3857))] {
+        let options = ingest::Options { crs, ..ingest::Options::default() };
+        let source = ingest::open(std::slice::from_ref(&dem), &options).expect("the file just written");
+        let (grid, mut out) = (source.grid(), Vec::new());
+        group
+            .throughput(Throughput::Elements(u64::from(grid.width) * u64::from(grid.height)))
+            .sample_size(10);
+        group.bench_function(name, |b| {
+            b.iter(|| {
+                for y in (0..grid.height).step_by(512) {
+                    for x in (0..grid.width).step_by(512) {
+                        let [w, h] = [grid.width - x, grid.height - y].map(|n| n.min(512));
+                        source.read(x, y, w, h, &mut out).expect("a window of the source");
+                    }
+                }
+            });
+        });
+    }
+    group.finish();
 }
 
 /// A whole build, disk included.
@@ -31,18 +56,7 @@ fn whole(criterion: &mut Criterion, folder: &Path) {
     let shape = format!("{0}x{0}:i16", SIDE + 1).parse().expect("a shape");
     let ingest = ingest::Options { raw: Some(shape), cell: Some(30.0), ..ingest::Options::default() };
     let source = ingest::open(&[dem], &ingest).expect("the file just written");
-    let options = hierarchy::Options {
-        scene: "bench".to_owned(),
-        layer: "terrain".to_owned(),
-        kind: Kind::Terrain,
-        max_error: 0.0,
-        rule: Rule::Smooth,
-        quantum: None,
-        patch_log2: 6,
-        memory: 1 << 30,
-        fresh: true,
-        checkpoint: hierarchy::CHECKPOINT,
-    };
+    let options = hierarchy::Options { memory: 1 << 30, fresh: true, ..hierarchy::Options::new("bench") };
     let mut group = criterion.benchmark_group("build");
     group.throughput(Throughput::Elements(u64::from(SIDE + 1).pow(2))).sample_size(10);
     group.bench_function("whole", |b| {
@@ -78,6 +92,7 @@ fn main() {
         });
     }
     group.finish();
+    read(&mut criterion, folder.path());
     whole(&mut criterion, folder.path());
     criterion.final_summary();
 }

@@ -1,16 +1,14 @@
 //! The demonstration: a made landscape, built, served and drawn by the client.
 
+use crate::client_program::{self, NoClient};
 use crate::hierarchy::{self, BuildError, Options};
 use crate::http::{ServeError, Server};
 use crate::ingest::{self, IngestError};
 use crate::progress::Progress;
 use crate::sample;
-use diamantina_protocol::message::Kind;
-use diamantina_protocol::points::Rule;
 use std::io::{self, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 
 /// Why the demonstration stopped.
 #[derive(Debug, thiserror::Error)]
@@ -36,8 +34,8 @@ pub enum DemoError {
     #[error(transparent)]
     Serve(#[from] ServeError),
     /// There is no client to draw with.
-    #[error("{0}: not found; build the client beside the server: cargo build --release -p diamantina-client")]
-    NoClient(PathBuf),
+    #[error(transparent)]
+    NoClient(#[from] NoClient),
     /// The client failed.
     #[error("the client could not draw the picture; its message is above")]
     Client,
@@ -64,27 +62,13 @@ pub fn run(folder: &Path, samples: u32, listen: SocketAddr, headless: bool) -> R
     };
     std::fs::create_dir_all(folder).map_err(at(folder))?;
     let server_program = std::env::current_exe().map_err(at(folder))?;
-    let client = server_program.with_file_name("diamantina-client");
-    if !client.exists() {
-        return Err(DemoError::NoClient(client));
-    }
+    let client = client_program::path()?;
     let (dem, store, picture) = (folder.join("sample.tif"), folder.join("sample"), folder.join("sample.png"));
     say(&format!("Making a landscape of {samples} x {samples} samples: {}", dem.display()));
     sample::write(&dem, samples).map_err(DemoError::Sample)?;
     say(&format!("Building the store: {}", store.display()));
     let source = ingest::open(std::slice::from_ref(&dem), &ingest::Options::default())?;
-    let options = Options {
-        scene: "sample".to_owned(),
-        layer: "terrain".to_owned(),
-        kind: Kind::Terrain,
-        max_error: 0.5,
-        rule: Rule::Smooth,
-        quantum: None,
-        patch_log2: 6,
-        memory: 1 << 30,
-        fresh: false,
-        checkpoint: hierarchy::CHECKPOINT,
-    };
+    let options = Options { max_error: 0.5, memory: 1 << 30, ..Options::new("sample") };
     let report = hierarchy::build(&source, &store, &options, &Progress::new())?;
     say(&format!(
         "  {} diamonds, {} bytes, {:.2} bits a sample at 0.5 m, {:.1} s",
@@ -106,7 +90,7 @@ pub fn run(folder: &Path, samples: u32, listen: SocketAddr, headless: bool) -> R
                 let _ = stopped.await;
             })
         });
-        let drawn = draw(&client, &url, &picture);
+        let drawn = draw(&url, &picture);
         if drawn.is_ok() {
             say(&format!("Picture: {}", picture.display()));
             let program = client.display();
@@ -133,18 +117,12 @@ pub fn run(folder: &Path, samples: u32, listen: SocketAddr, headless: bool) -> R
     })
 }
 
-fn draw(client: &Path, url: &str, picture: &Path) -> Result<(), DemoError> {
-    let mut command = Command::new(client);
-    command.arg("render").arg(url).arg("-o").arg(picture);
-    if std::env::var_os("XDG_RUNTIME_DIR").is_none() {
-        // Without a session Mesa's device selection complains on standard error, as if we had failed.
-        command.env("NODEVICE_SELECT", "1");
-    }
-    let status = command.status();
-    match status {
+fn draw(url: &str, picture: &Path) -> Result<(), DemoError> {
+    let mut command = client_program::command()?;
+    match command.arg("render").arg(url).arg("-o").arg(picture).status() {
         Ok(status) if status.success() => Ok(()),
         Ok(_) => Err(DemoError::Client),
-        Err(error) => Err(DemoError::Io { path: client.to_owned(), error }),
+        Err(error) => Err(DemoError::Io { path: command.get_program().into(), error }),
     }
 }
 

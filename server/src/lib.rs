@@ -2,6 +2,7 @@
 
 pub mod canvas;
 pub mod chunks;
+pub mod client_program;
 pub mod curve;
 pub mod demo;
 pub mod experiment;

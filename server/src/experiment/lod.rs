@@ -6,17 +6,16 @@
 
 use super::report::{Report, Table};
 use super::{ExperimentError, Whole};
+use crate::client_program::{self, NoClient};
 use crate::hierarchy::{self, BuildError};
 use crate::http::{ServeError, Server};
 use crate::ingest::{self, Source};
 use crate::progress::Progress;
-use diamantina_protocol::message::{Kind, Scene};
-use diamantina_protocol::points::Rule;
+use diamantina_protocol::message::Scene;
 use serde::Serialize;
 use std::io;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
-use std::process::Command;
 
 /// How to fly.
 #[derive(Debug, Clone, Copy, clap::Args)]
@@ -64,8 +63,8 @@ pub enum LodError {
     #[error(transparent)]
     Serve(#[from] ServeError),
     /// There is no client to fly with.
-    #[error("{0}: not found; build the client beside the server: cargo build --release -p diamantina-client")]
-    NoClient(PathBuf),
+    #[error(transparent)]
+    NoClient(#[from] NoClient),
     /// The client failed.
     #[error("the client could not fly '{flight}': {message}")]
     Client {
@@ -163,13 +162,10 @@ fn fly_over(source: &Source, plan: &Options, progress: &Progress) -> Result<Vec<
         move |error| LodError::Io { path, error }
     };
     let folder = std::env::temp_dir();
-    let client = std::env::current_exe().map_err(at(&folder))?.with_file_name("diamantina-client");
-    if !client.exists() {
-        return Err(LodError::NoClient(client));
-    }
+    client_program::path()?;
     let work = tempfile::Builder::new().prefix("diamantina-lod").tempdir_in(&folder).map_err(at(&folder))?;
     let store = work.path().join("scene");
-    let scene = hierarchy::build(source, &store, &build_options(), progress)?.scene;
+    let scene = hierarchy::build(source, &store, &hierarchy::Options::new("flight"), progress)?.scene;
     let server = Server::open(&[store], SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))?;
     let url = format!("{}/scenes/{}", server.address(), scene.name);
     let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
@@ -180,30 +176,14 @@ fn fly_over(source: &Source, plan: &Options, progress: &Progress) -> Result<Vec<
                 let _ = stopped.await;
             })
         });
-        let flown = fly_all(&client, &url, work.path(), &scene, plan, progress);
+        let flown = fly_all(&url, work.path(), &scene, plan, progress);
         let _ = stop.send(());
         let served = serving.join().unwrap_or(Ok(()));
         flown.and_then(|flown| served.map(|()| flown).map_err(LodError::from))
     })
 }
 
-fn build_options() -> hierarchy::Options {
-    hierarchy::Options {
-        scene: "flight".to_owned(),
-        layer: "terrain".to_owned(),
-        kind: Kind::Terrain,
-        max_error: 0.0,
-        rule: Rule::Smooth,
-        quantum: None,
-        patch_log2: 6,
-        memory: 1 << 30,
-        fresh: false,
-        checkpoint: hierarchy::CHECKPOINT,
-    }
-}
-
 fn fly_all(
-    client: &Path,
     url: &str,
     work: &Path,
     scene: &Scene,
@@ -218,7 +198,7 @@ fn fly_all(
         let text = serde_json::json!({ "keys": keys }).to_string();
         std::fs::write(&file, text).map_err(|error| LodError::Io { path: file.clone(), error })?;
         for terms in &TERMS {
-            let mut command = Command::new(client);
+            let mut command = client_program::command()?;
             command.arg("fly").arg(url).arg("--path").arg(&file).args(["--csv", "-", "--fps", "0"]);
             command.args(["--settle", PATIENCE, "--no-antialias"]);
             command.args(["--size".to_owned(), format!("{}x{}", SIZE[0], SIZE[1])]);
@@ -295,7 +275,7 @@ fn paths(scene: &Scene) -> Vec<(&'static str, Vec<Key>)> {
     };
     let ahead = |down: f64| move |[x, y, z]: [f64; 3]| [x + size[0], y + size[1], z - down * span];
     vec![
-        ("down", along(&over(0.08), &|[x, y, z]| [x, y, z - span])),
+        ("down", along(&over(0.4), &|[x, y, z]| [x, y, z - span])),
         ("slanting", along(&over(0.08), &ahead(0.7))),
         ("low", along(&over(0.01), &ahead(0.1))),
     ]

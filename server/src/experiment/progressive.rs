@@ -18,7 +18,7 @@
 use super::field::Field;
 use super::report::{Picture, Report, Table};
 use super::scan::surface;
-use super::select::{Ground, greedy};
+use super::select::{GREEDY_SHARE, Ground, greedy};
 use super::windows::Window;
 use super::{Criterion, ExperimentError, Run, plot, quadtree};
 use diamantina_protocol::NODATA;
@@ -28,8 +28,6 @@ use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::points::{self, Coding, Rule};
 use std::collections::HashMap;
 
-/// The share of a triangle's error at its middle for that to become real: see the selections.
-const SHARE: f64 = 0.3;
 const ZSTD_LEVEL: i32 = 19;
 /// Bytes of a corner's height.
 const CORNER_BYTES: usize = 4;
@@ -149,7 +147,7 @@ fn by_tolerance(field: &Field) -> Vec<Bitree> {
     while tolerance > 0.0 {
         tolerance = if tolerance < 1.0 { 0.0 } else { tolerance };
         let before = trees[trees.len() - 1].clone();
-        trees.push(greedy(&ground, Criterion::Vertical, tolerance, SHARE, usize::MAX, before));
+        trees.push(greedy(&ground, Criterion::Vertical, tolerance, GREEDY_SHARE, usize::MAX, before));
         tolerance /= 2.0;
     }
     trees
@@ -162,7 +160,7 @@ fn by_error(field: &Field) -> Vec<Bitree> {
     loop {
         let before = trees[trees.len() - 1].clone();
         let points = before.points().0;
-        let next = greedy(&ground, Criterion::Vertical, 0.0, SHARE, 2 * points, before);
+        let next = greedy(&ground, Criterion::Vertical, 0.0, GREEDY_SHARE, 2 * points, before);
         let is_done = next.points().0 < 2 * points;
         trees.push(next);
         if is_done {

@@ -73,6 +73,25 @@ pub struct Options {
     pub checkpoint: Duration,
 }
 
+impl Options {
+    /// A lossless terrain of smooth rule and 64 segments, in 2 GiB: what the command line says by itself.
+    #[must_use]
+    pub fn new(scene: &str) -> Self {
+        Self {
+            scene: scene.to_owned(),
+            layer: "terrain".to_owned(),
+            kind: Kind::Terrain,
+            max_error: 0.0,
+            rule: Rule::Smooth,
+            quantum: None,
+            patch_log2: 6,
+            memory: 2 << 30,
+            fresh: false,
+            checkpoint: CHECKPOINT,
+        }
+    }
+}
+
 /// Between two checkpoints, unless told otherwise. Syncing more often would cost more than a kill does.
 pub const CHECKPOINT: Duration = Duration::from_secs(5);
 

@@ -53,7 +53,7 @@ impl fmt::Display for Strategy {
 
 /// The share of a triangle's error that its middle has to explain to become real in a greedy selection. Of 0.3,
 /// 0.6 and 0.9 it gave the fewest points and triangles in all windows and at all tolerances.
-const GREEDY_SHARE: f64 = 0.3;
+pub const GREEDY_SHARE: f64 = 0.3;
 
 /// The points that keep a criterion's error of every triangle within `tolerance`, found in one way.
 #[must_use]
