@@ -12,7 +12,7 @@
 //! | offset | size | field | valid range |
 //! |---|---|---|---|
 //! | 0 | 1 | format | 1 |
-//! | 1 | 1 | floor: the visibility of what is hidden, in 255ths | 0 to 254 |
+//! | 1 | 1 | floor: the visibility of what is hidden, in 255ths | 0 to 254; 0 without layers |
 //! | 2 | 1 | layers | as many as the scene has |
 //! | 3 | 1 each | visibilities: layer by layer, level by level, in the order of [`Forest::diamonds`] | floor to bound |
 //!
@@ -305,7 +305,8 @@ pub fn decode(forests: &[Forest], bytes: &[u8]) -> Result<Vec<Mask>, ZoneError> 
         Some(found) => return Err(ZoneError::Format { found: *found }),
     }
     let (floor, layers) = (*bytes.get(1).ok_or_else(early)?, *bytes.get(2).ok_or_else(early)?);
-    if floor == u8::MAX {
+    // A floor without masks could not be written again.
+    if floor == u8::MAX || (layers == 0 && floor > 0) {
         return Err(ZoneError::Floor(floor));
     }
     if usize::from(layers) != forests.len() || forests.len() > LAYERS_MAX {
@@ -468,6 +469,8 @@ mod tests {
         assert_eq!(refused(&[1, 255, 1, 255]), ZoneError::Floor(255));
         // More layers than the scene has, before anything is allocated for them.
         assert_eq!(refused(&[1, 5, 255]), ZoneError::Layers { found: 255, expected: 1 });
+        // A floor without layers came back as 0.
+        assert_eq!(decode(&[], &[1, 5, 0]), Err(ZoneError::Floor(5)));
         let outside = |centre, found, least, most| ZoneError::Visibility { centre, found, least, most };
         assert_eq!(refused(&[1, 5, 1, 4]), outside([4, 4], 4, 5, 255), "below the floor");
         assert_eq!(refused(&[1, 5, 1, 9, 10]), outside([4, 0], 10, 5, 9), "above its parent");
