@@ -84,7 +84,7 @@ mod tests {
         assert!((0..forest.levels()).all(|level| forest.hypotenuse(level, [30.0, 20.0]) >= least));
         #[allow(clippy::cast_possible_truncation, reason = "metres")]
         let of = |metres: f64| is_vertical(&forest, 3, metres as f32, [30.0, 20.0]);
-        assert!(of(least * 0.99) && !of(least));
+        assert!(of(least * 0.999) && !of(least * 1.001));
         assert!(is_vertical(&forest, forest.levels(), f32::MAX, [30.0, 20.0]), "there are no finer outlines");
     }
 }
