@@ -344,6 +344,49 @@ impl Bitree {
     }
 }
 
+/// A bitree to which many points are added before it is asked what it draws: triangles are counted once, at the end.
+#[derive(Debug)]
+pub struct Draft(Bitree);
+
+impl Draft {
+    /// From a selection so far.
+    #[must_use]
+    pub fn of(tree: Bitree) -> Self {
+        Self(tree)
+    }
+
+    /// See [`Bitree::add`].
+    pub fn add(&mut self, point: Point, height: f64) -> Option<f64> {
+        if !self.0.inside(point) || height.is_nan() {
+            return None;
+        }
+        let slot = self.0.slot(point);
+        let before = std::mem::replace(&mut self.0.real[slot], height);
+        (!before.is_nan()).then_some(before)
+    }
+
+    /// See [`Bitree::around`].
+    #[must_use]
+    pub fn around(&self, point: Point) -> [Option<Facet>; 2] {
+        self.0.around(point)
+    }
+
+    /// See [`Bitree::halves`].
+    #[must_use]
+    pub fn halves(&self, facet: &Facet) -> [Facet; 2] {
+        self.0.halves(facet)
+    }
+
+    /// The selection. Costs one step a triangle of the grid.
+    #[must_use]
+    pub fn finish(mut self) -> Bitree {
+        for root in self.0.roots() {
+            self.0.recount(root.path, root.corners);
+        }
+        self.0
+    }
+}
+
 /// What was selected is the same; counts follow from it.
 impl PartialEq for Bitree {
     fn eq(&self, other: &Self) -> bool {
@@ -405,6 +448,18 @@ mod tests {
         assert_eq!(bitree.presence([0, 4]), Presence::Fictitious);
         assert_eq!(bitree.presence([4, 0]), Presence::Absent, "a restricted quadtree would need it");
         assert_eq!(bitree.presence([1, 2]), Presence::Real);
+    }
+
+    #[test]
+    fn a_draft_becomes_what_single_points_make() {
+        let mut bitree = flat(3);
+        bitree.add([4, 4], 1.0);
+        let mut draft = Draft::of(bitree.clone());
+        for (point, height) in [([1, 2], 7.0), ([6, 6], 3.0), ([4, 4], 2.0), ([0, 0], 5.0), ([9, 0], 1.0)] {
+            assert_eq!(draft.add(point, height), bitree.add(point, height), "{point:?}");
+            assert_eq!(draft.around([2, 2]), bitree.around([2, 2]));
+        }
+        assert_eq!(draft.finish(), bitree);
     }
 
     #[test]

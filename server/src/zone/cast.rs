@@ -22,11 +22,12 @@
 )]
 
 use super::relief::{BLOCKS_LOG2, Relief};
+use super::tiled::Tiled;
 use crate::progress::Progress;
 use diamantina_protocol::NODATA;
 use diamantina_protocol::zone::pack;
 use rayon::prelude::*;
-use std::f64::consts::{SQRT_2, TAU};
+use std::f64::consts::{FRAC_1_SQRT_2, SQRT_2, TAU};
 use std::sync::atomic::{AtomicU8, Ordering};
 
 /// The radius of the Earth, in metres: the mean of its axes.
@@ -45,8 +46,9 @@ const WINDOWS_MAX: usize = 16;
 /// Slopes closer than this are the same: some thousand times the rounding of the arithmetic.
 const SAME: f64 = 1e-11;
 
-/// The largest share that is told of a small block as one. Where more is open to doubt, its cells tell better.
-const BLOCK_SHARE_MAX: f64 = 0.2;
+/// The largest share that is told of a small block as one: less than as good as seen. Where more is open to doubt,
+/// its cells tell better.
+const BLOCK_SHARE_MAX: f64 = FRAC_1_SQRT_2;
 
 /// Azimuths that are worked on at once.
 const AZIMUTHS_AT_ONCE: usize = 512;
@@ -100,9 +102,9 @@ impl Optics {
 /// The visibility of every sample, in 255ths: the largest of the triangles around it, from any of the eyes. What
 /// nobody sees has that of [`Optics::hidden`]. `None` if `progress` was told to stop.
 ///
-/// Takes a byte a sample and 1/64 more. The result does not depend on the number of threads.
+/// Takes a byte a sample and 1/16 more. The result does not depend on the number of threads.
 #[must_use]
-pub fn cast(relief: &Relief, optics: &Optics, eyes: &[Eye], progress: &Progress) -> Option<Vec<u8>> {
+pub fn cast(relief: &Relief, optics: &Optics, eyes: &[Eye], progress: &Progress) -> Option<Tiled<u8>> {
     let floor = pack(optics.hidden);
     let works: Vec<(Eye, usize, usize)> = eyes
         .iter()
@@ -119,61 +121,68 @@ pub fn cast(relief: &Relief, optics: &Optics, eyes: &[Eye], progress: &Progress)
         for i in *first..(first + AZIMUTHS_AT_ONCE).min(*azimuths) {
             // Half a step off the axes, along which rays would run on the edges of triangles.
             let azimuth = (i as f64 + 0.5) / *azimuths as f64 * TAU;
-            walk(relief, optics, *eye, azimuth, |seen| sheets.note(&seen));
+            Walk {
+                plane: Plane::new(relief, optics, *eye, azimuth),
+                sky: Sky::new(optics),
+                witness: &sheets,
+            }
+            .run();
         }
         if *first == 0 {
             progress.advance(1);
         }
     });
-    (!progress.is_stopping()).then(|| sheets.merged())
+    (!progress.is_stopping()).then(|| sheets.merged(relief))
 }
 
-/// What has been seen so far, in 255ths: of samples, and of whole blocks.
-struct Sheets {
+/// What has been seen so far, in 255ths: of samples, in the order of the relief's tiles, and of whole blocks.
+struct Sheets<'a> {
     floor: u8,
-    size: [usize; 2],
+    heights: &'a Tiled<i32>,
     samples: Vec<AtomicU8>,
     blocks_size: [usize; 2],
     blocks: Vec<AtomicU8>,
+    /// The least of the samples of a block, or what it was not long ago.
+    least: Vec<AtomicU8>,
 }
 
-impl Sheets {
-    fn new(relief: &Relief, floor: u8) -> Self {
-        let sheet = |[w, h]: [usize; 2]| (0..w * h).map(|_| AtomicU8::new(floor)).collect();
-        let (size, blocks_size) = (relief.size(), relief.blocks_size());
-        Self { floor, size, samples: sheet(size), blocks_size, blocks: sheet(blocks_size) }
+impl<'a> Sheets<'a> {
+    fn new(relief: &'a Relief, floor: u8) -> Self {
+        let sheet = |count: usize| (0..count).map(|_| AtomicU8::new(floor)).collect();
+        let (heights, blocks_size) = (relief.heights(), relief.blocks_size());
+        let samples = sheet(heights.items().len());
+        let blocks = blocks_size[0] * blocks_size[1];
+        Self { floor, heights, samples, blocks_size, blocks: sheet(blocks), least: sheet(blocks) }
     }
 
-    fn note(&self, seen: &Seen) {
-        let share = stepped(seen.share, self.floor);
-        let raise = |sheet: &[AtomicU8], width: usize, [x, y]: [usize; 2]| {
-            let here = &sheet[y * width + x];
-            // Most are known already, and looking costs less than changing.
-            if here.load(Ordering::Relaxed) < share {
-                here.fetch_max(share, Ordering::Relaxed);
-            }
-        };
-        match seen.region {
-            Region::Triangle(corners) => corners.iter().for_each(|c| raise(&self.samples, self.size[0], *c)),
-            Region::Cell([x, y]) => [[x, y], [x + 1, y], [x, y + 1], [x + 1, y + 1]]
-                .iter()
-                .for_each(|c| raise(&self.samples, self.size[0], *c)),
-            Region::Block(block) => raise(&self.blocks, self.blocks_size[0], block),
-        }
-    }
-
-    fn merged(self) -> Vec<u8> {
-        let mut samples: Vec<u8> = self.samples.into_iter().map(AtomicU8::into_inner).collect();
+    /// The least that is known of the samples of a block.
+    fn least(&self, [x, y]: [usize; 2]) -> u8 {
         let side = 1usize << BLOCKS_LOG2[0];
+        let [columns, rows] = [0, 1].map(|axis| {
+            let first = [x, y][axis] * side;
+            first..=(first + side).min(self.heights.size()[axis] - 1)
+        });
+        let mut least = u8::MAX;
+        for row in rows.map(|y| self.heights.offset(1, y)) {
+            for column in columns.clone().map(|x| self.heights.offset(0, x)) {
+                least = least.min(self.samples[row + column].load(Ordering::Relaxed));
+            }
+        }
+        least
+    }
+
+    fn merged(self, relief: &Relief) -> Tiled<u8> {
+        let mut samples = self.heights.like(self.samples.into_iter().map(AtomicU8::into_inner).collect());
+        let side = 1usize << BLOCKS_LOG2[0];
+        let [width, height] = relief.size();
         for (i, share) in self.blocks.into_iter().map(AtomicU8::into_inner).enumerate() {
-            let [x, y] = [i % self.blocks_size[0] * side, i / self.blocks_size[0] * side];
             if share == self.floor {
                 continue;
             }
-            for y in y..=(y + side).min(self.size[1] - 1) {
-                let row = y * self.size[0];
-                for sample in &mut samples[row + x..=row + (x + side).min(self.size[0] - 1)] {
-                    *sample = (*sample).max(share);
+            let [x, y] = [i % self.blocks_size[0] * side, i / self.blocks_size[0] * side];
+            for y in y..=(y + side).min(height - 1) {
+                for x in x..=(x + side).min(width - 1) {
+                    samples.set([x, y], share.max(samples.at([x, y])));
                 }
             }
         }
@@ -181,11 +190,77 @@ impl Sheets {
     }
 }
 
-/// A share as it is kept: in 255ths, at one of the steps 1, 1/√2, 1/2, ... above it, so that masks compress.
-fn stepped(share: f64, floor: u8) -> u8 {
-    let halvings = (-2.0 * share.log2()).floor().clamp(0.0, 16.0) / 2.0;
-    pack((-halvings).exp2().max(share)).max(floor)
+/// Who is shown what rays meet.
+trait Witness {
+    fn note(&mut self, seen: Seen);
+
+    /// Whether of a block of the smallest kind so much is known that a share changes nothing.
+    fn knows_block(&self, _block: [usize; 2], _share: f64) -> bool {
+        false
+    }
+
+    /// Whether all four samples of a cell, by their place among the heights, are known to be seen.
+    fn knows_seen(&self, _corners: [usize; 4]) -> bool {
+        false
+    }
 }
+
+impl<F: FnMut(Seen)> Witness for F {
+    fn note(&mut self, seen: Seen) {
+        self(seen);
+    }
+}
+
+impl Witness for &Sheets<'_> {
+    fn note(&mut self, seen: Seen) {
+        let share = stepped(seen.share, self.floor);
+        let raise = |here: &AtomicU8| {
+            // Most are known already, and looking costs less than changing.
+            if here.load(Ordering::Relaxed) < share {
+                here.fetch_max(share, Ordering::Relaxed);
+            }
+        };
+        match seen.region {
+            Region::Triangle(corners) => {
+                corners.iter().for_each(|c| raise(&self.samples[self.heights.index(*c)]))
+            }
+            Region::Cell([x, y]) => {
+                let columns = [x, x + 1].map(|x| self.heights.offset(0, x));
+                for row in [y, y + 1].map(|y| self.heights.offset(1, y)) {
+                    columns.iter().for_each(|column| raise(&self.samples[row + column]));
+                }
+            }
+            Region::Block([x, y]) => raise(&self.blocks[y * self.blocks_size[0] + x]),
+        }
+    }
+
+    fn knows_block(&self, block: [usize; 2], share: f64) -> bool {
+        let share = stepped(share, self.floor);
+        let known = &self.least[block[1] * self.blocks_size[0] + block[0]];
+        if known.load(Ordering::Relaxed) >= share {
+            return true;
+        }
+        let least = self.least(block);
+        known.store(least, Ordering::Relaxed);
+        least >= share
+    }
+
+    fn knows_seen(&self, corners: [usize; 4]) -> bool {
+        corners.iter().all(|i| self.samples[*i].load(Ordering::Relaxed) == u8::MAX)
+    }
+}
+
+/// A share as it is kept: in 255ths, at the least of the steps 1, 1/√2, 1/2, ... 1/256 that is not below it, so that
+/// masks compress.
+fn stepped(share: f64, floor: u8) -> u8 {
+    // Half the binary logarithm of the share's square: its exponent, but for a power of two itself.
+    let bits = (share * share).to_bits();
+    let exponent = (bits >> 52) as i64 - 1023 + i64::from(bits << 12 != 0);
+    STEPS[(-exponent).clamp(0, STEPS.len() as i64 - 1) as usize].max(floor)
+}
+
+/// 255 times the powers of 1/√2, rounded up.
+const STEPS: [u8; 17] = [255, 181, 128, 91, 64, 46, 32, 23, 16, 12, 8, 6, 4, 3, 2, 2, 1];
 
 /// A part of the relief, in samples from the south-west.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -212,35 +287,22 @@ pub struct Seen {
 /// Follows the rays of one azimuth (radians from the x axis to the y axis) and shows what is seen or nearly, in order of
 /// distance; what has a share of [`Optics::hidden`] or less is left out.
 pub fn walk(relief: &Relief, optics: &Optics, eye: Eye, azimuth: f64, visit: impl FnMut(Seen)) {
-    let along = [azimuth.cos() / optics.cell[0], azimuth.sin() / optics.cell[1]];
-    let major = usize::from(along[1].abs() > along[0].abs());
-    let steep = along[major].abs();
-    let plane = Plane {
-        relief,
-        major,
-        sizes: [relief.size()[major], relief.size()[1 - major]],
-        eye: [eye.place[major], eye.place[1 - major]],
-        height: eye.height,
-        forward: along[major] > 0.0,
-        lean: along[1 - major] / steep,
-        step: 1.0 / steep,
-        bend: optics.bend / optics.quantum,
-    };
-    let sky = Sky { horizon: f64::NEG_INFINITY, windows: Vec::new(), optics, least: optics.least() };
-    Walk { plane, sky, visit }.run();
+    Walk { plane: Plane::new(relief, optics, eye, azimuth), sky: Sky::new(optics), witness: visit }.run();
 }
 
 /// The vertical plane of an azimuth. Columns of cells are crossed one by one along the major axis, the one along
 /// which the azimuth crosses more of them; `u` counts cells along it from the eye.
 struct Plane<'a> {
     relief: &'a Relief,
+    heights: &'a Tiled<i32>,
     /// 0 for x, 1 for y. Places in the plane's frame are `[major, minor]`.
     major: usize,
     /// Samples.
     sizes: [usize; 2],
     eye: [f64; 2],
     height: f64,
-    forward: bool,
+    /// 1 where the azimuth goes up the major axis, else -1.
+    sign: f64,
     /// Cells along the minor axis for one along the major: -1 to 1.
     lean: f64,
     /// Metres for a cell along the major axis.
@@ -249,61 +311,122 @@ struct Plane<'a> {
     bend: f64,
 }
 
-impl Plane<'_> {
-    fn minor(&self, u: f64) -> f64 {
-        self.eye[1] + self.lean * u
+/// A place along the plane.
+#[derive(Clone, Copy)]
+struct Post {
+    u: f64,
+    /// Its place along the minor axis.
+    minor: f64,
+    /// One over its distance in metres.
+    inverse: f64,
+    /// Quanta by which the eye stands above what is seen at the slope 0 there: its height, and the ground sinks.
+    fall: f64,
+}
+
+impl Post {
+    /// The slope at which a height in quanta is seen.
+    fn slope(&self, height: f64) -> f64 {
+        let above = height - self.fall;
+        if self.inverse.is_finite() { above * self.inverse } else { f64::INFINITY.copysign(above) }
+    }
+}
+
+/// The most at which a height is seen between two posts.
+fn highest_slope(height: f64, [near, far]: [&Post; 2]) -> f64 {
+    let above = height - near.fall;
+    above * if above > 0.0 { near.inverse } else { far.inverse }
+}
+
+/// The least at which a height is seen between two posts.
+fn lowest_slope(height: f64, [near, far]: [&Post; 2]) -> f64 {
+    let above = height - far.fall;
+    above * if above < 0.0 { near.inverse } else { far.inverse }
+}
+
+impl<'a> Plane<'a> {
+    fn new(relief: &'a Relief, optics: &Optics, eye: Eye, azimuth: f64) -> Self {
+        let along = [azimuth.cos() / optics.cell[0], azimuth.sin() / optics.cell[1]];
+        let major = usize::from(along[1].abs() > along[0].abs());
+        let steep = along[major].abs();
+        Self {
+            relief,
+            heights: relief.heights(),
+            major,
+            sizes: [relief.size()[major], relief.size()[1 - major]],
+            eye: [eye.place[major], eye.place[1 - major]],
+            height: eye.height,
+            sign: 1f64.copysign(along[major]),
+            lean: along[1 - major] / steep,
+            step: 1.0 / steep,
+            bend: optics.bend / optics.quantum,
+        }
     }
 
-    /// `u` of a line between columns.
-    fn to_line(&self, line: usize) -> f64 {
-        let u = line as f64 - self.eye[0];
-        if self.forward { u } else { -u }
+    fn post(&self, u: f64) -> Post {
+        let distance = u * self.step;
+        Post {
+            u,
+            minor: self.eye[1] + self.lean * u,
+            inverse: 1.0 / distance,
+            fall: self.height + self.bend * distance * distance,
+        }
+    }
+
+    /// The post at a line between columns.
+    fn at_line(&self, line: usize) -> Post {
+        self.post((line as f64 - self.eye[0]) * self.sign)
     }
 
     fn sample(&self, [k, j]: [usize; 2]) -> [usize; 2] {
         if self.major == 0 { [k, j] } else { [j, k] }
-    }
-
-    /// The slope at which a height in quanta is seen.
-    fn slope(&self, height: f64, u: f64) -> f64 {
-        let distance = u * self.step;
-        let above = height - self.height - self.bend * distance * distance;
-        if distance > 0.0 { above / distance } else { f64::INFINITY.copysign(above) }
-    }
-
-    /// Slopes between which all is seen that lies between two heights, from `near` to `far`.
-    fn slopes(&self, [low, high]: [f64; 2], [near, far]: [f64; 2]) -> [f64; 2] {
-        let [near, far] = [near * self.step, far * self.step];
-        let rise = high - self.height - self.bend * near * near;
-        let fall = low - self.height - self.bend * far * far;
-        let over = |above: f64, distance: f64| {
-            if distance > 0.0 { above / distance } else { f64::INFINITY.copysign(above) }
-        };
-        [over(fall, if fall < 0.0 { near } else { far }), over(rise, if rise > 0.0 { near } else { far })]
     }
 }
 
 /// The slopes that are still open: all above the horizon, and some windows below it, from low to high.
 struct Sky<'a> {
     horizon: f64,
+    /// Above this a slope is above the horizon by more than rounding.
+    threshold: f64,
     windows: Vec<[f64; 2]>,
+    /// The highest slope of all windows.
+    ajar: f64,
+    /// Kept to be filled again.
+    spare: Vec<[f64; 2]>,
     optics: &'a Optics,
     least: f64,
 }
 
-/// Whether a slope is above another by more than rounding.
+/// Above this a slope is above another by more than rounding.
+fn threshold(slope: f64) -> f64 {
+    if slope.is_infinite() { slope } else { slope + SAME * (1.0 + slope.abs()) }
+}
+
 fn is_above(a: f64, b: f64) -> bool {
-    a > b && (b.is_infinite() || a - b > SAME * (1.0 + b.abs()))
+    a > threshold(b)
 }
 
 fn overlap([lo, hi]: [f64; 2], [least, most]: [f64; 2]) -> bool {
     is_above(hi, least) && is_above(most, lo)
 }
 
-impl Sky<'_> {
+impl<'a> Sky<'a> {
+    fn new(optics: &'a Optics) -> Self {
+        let (horizon, least) = (f64::NEG_INFINITY, optics.least());
+        Self {
+            horizon,
+            threshold: horizon,
+            windows: Vec::new(),
+            ajar: horizon,
+            spare: Vec::new(),
+            optics,
+            least,
+        }
+    }
+
     /// Whether some of the slopes between two are open.
     fn shows(&self, slopes: [f64; 2]) -> bool {
-        is_above(slopes[1], self.horizon) || self.windows.iter().any(|window| overlap(slopes, *window))
+        slopes[1] > self.threshold
+            || slopes[0] < self.ajar && self.windows.iter().any(|window| overlap(slopes, *window))
     }
 
     /// What the errors of something count for that lies between two slopes, none of them open.
@@ -311,203 +434,238 @@ impl Sky<'_> {
         if self.optics.angle == 0.0 {
             return 0.0;
         }
-        let mut share = self.beside(lo, hi, self.horizon);
-        for [least, most] in &self.windows {
-            let below = !is_above(hi, *least);
-            share = share.max(self.beside(lo, hi, if below { *least } else { *most }));
+        let Optics { quantum, .. } = *self.optics;
+        let mut share = self.beside(hi, self.horizon);
+        // Towards a border above, the count grows as long as slopes are above h - √(h² + 1): see `beside`.
+        if lo * quantum < -0.5 || self.horizon * quantum > 0.5 {
+            share = share.max(self.beside(lo, self.horizon));
+        }
+        // Of windows only the next below and the next above count.
+        if !self.windows.is_empty() {
+            let above = self.windows.iter().position(|[least, _]| !is_above(hi, *least));
+            let below = above.unwrap_or(self.windows.len()).checked_sub(1);
+            let borders = [above.map(|i| self.windows[i][0]), below.map(|i| self.windows[i][1])];
+            for border in borders.into_iter().flatten() {
+                share = share.max(self.beside(lo, border)).max(self.beside(hi, border));
+            }
         }
         share.min(1.0)
     }
 
-    /// The same beside one border of what is open, for all slopes between two. A vertical error E at the distance t
+    /// The same for one slope beside one border of what is open. A vertical error E at the distance t
     /// and the slope s is seen as E / (t (1 + s²)) and changes the slope by E / t. Of all slopes between two, one of
     /// both counts for the most: in between, the quotient has a least value, if any.
-    fn beside(&self, a: f64, b: f64, border: f64) -> f64 {
+    fn beside(&self, slope: f64, border: f64) -> f64 {
         let Optics { angle, quantum, .. } = *self.optics;
-        let count = |slope: f64| {
-            let gap = (border - slope).abs() * quantum;
-            // Straight down, no vertical error is seen.
-            if slope.is_infinite() { 1.0 } else { angle * (1.0 + (slope * quantum).powi(2)) / gap }
-        };
-        count(a).max(count(b))
+        let gap = (border - slope).abs() * quantum;
+        let slope = slope * quantum;
+        // Straight down, no vertical error is seen.
+        if slope.is_infinite() { 1.0 } else { angle * (1.0 + slope * slope) / gap }
     }
 
     /// Closes the slopes between two.
     fn cover(&mut self, [lo, hi]: [f64; 2]) {
-        if self.windows.is_empty() && !is_above(lo, self.horizon) {
-            self.horizon = self.horizon.max(hi);
-            return;
+        if lo < self.ajar && self.windows.iter().any(|window| overlap([lo, hi], *window)) {
+            // What is left of each; at most two parts.
+            let mut before = std::mem::take(&mut self.spare);
+            std::mem::swap(&mut before, &mut self.windows);
+            for [least, most] in before.drain(..) {
+                if !overlap([lo, hi], [least, most]) {
+                    self.windows.push([least, most]);
+                    continue;
+                }
+                if is_above(lo, least) {
+                    self.windows.push([least, lo]);
+                }
+                if is_above(most, hi) {
+                    self.windows.push([hi, most]);
+                }
+            }
+            self.spare = before;
         }
-        let mut open = std::mem::take(&mut self.windows);
-        open.push([self.horizon, f64::INFINITY]);
-        for [least, most] in open {
-            if !overlap([lo, hi], [least, most]) {
-                self.windows.push([least, most]);
-                continue;
-            }
-            if is_above(lo, least) {
-                self.windows.push([least, lo]);
-            }
-            if is_above(most, hi) {
-                self.windows.push([hi, most]);
-            }
+        if is_above(hi, self.horizon) && is_above(lo, self.horizon) {
+            self.windows.push([self.horizon, lo]);
         }
-        // The last is what is open above all.
-        self.horizon = self.windows.pop().map_or(self.horizon, |[horizon, _]| horizon);
-        if self.windows.len() > WINDOWS_MAX {
+        if hi > self.horizon {
+            self.horizon = hi;
+            self.threshold = threshold(hi);
+        }
+        while self.windows.len() > WINDOWS_MAX {
             self.windows[1][0] = self.windows[0][0];
             self.windows.remove(0);
         }
+        self.ajar = self.windows.last().map_or(f64::NEG_INFINITY, |[_, most]| *most);
     }
 }
 
-struct Walk<'a, F> {
+struct Walk<'a, W> {
     plane: Plane<'a>,
     sky: Sky<'a>,
-    visit: F,
+    witness: W,
 }
 
-impl<F: FnMut(Seen)> Walk<'_, F> {
+/// The whole number below, for numbers above -2.
+fn floor(w: f64) -> i32 {
+    // The processor's own rounding, which x86-64 has for whole numbers only, and towards zero.
+    (w + 2.0) as i32 - 2
+}
+
+impl<W: Witness> Walk<'_, W> {
     fn run(&mut self) {
         let columns = self.plane.sizes[0] - 1;
         let eye = self.plane.eye[0];
+        let forward = self.plane.sign > 0.0;
         // A column number of -1 wraps, and is beyond all columns like any other.
-        let mut column =
-            if self.plane.forward { eye.floor() as usize } else { (eye.ceil() as usize).wrapping_sub(1) };
-        let mut from = 0.0;
-        let mut tried = [usize::MAX; 2];
+        let mut column = if forward { eye.floor() as usize } else { (eye.ceil() as usize).wrapping_sub(1) };
+        let mut from = self.plane.post(0.0);
+        let mut tried = [usize::MAX; BLOCKS_LOG2.len()];
         'columns: while column < columns {
-            for which in [1, 0] {
+            for which in (0..BLOCKS_LOG2.len()).rev() {
                 let block = column >> BLOCKS_LOG2[which];
                 if tried[which] == block {
                     continue;
                 }
                 tried[which] = block;
-                if let Some(line) = self.beyond(which, block, from) {
-                    from = self.plane.to_line(line);
-                    column = if self.plane.forward { line } else { line.wrapping_sub(1) };
+                let first = block << BLOCKS_LOG2[which];
+                let line = if forward { (first + (1 << BLOCKS_LOG2[which])).min(columns) } else { first };
+                let to = self.plane.at_line(line);
+                if self.is_over(which, block, [&from, &to]) {
+                    from = to;
+                    column = if forward { line } else { line.wrapping_sub(1) };
                     continue 'columns;
                 }
             }
-            let line = if self.plane.forward { column + 1 } else { column };
-            let to = self.plane.to_line(line);
-            if !self.column(column, [from, to]) {
+            let to = self.plane.at_line(if forward { column + 1 } else { column });
+            if !self.column(column, [&from, &to]) {
                 return;
             }
             from = to;
-            column = if self.plane.forward { column + 1 } else { column.wrapping_sub(1) };
+            column = if forward { column + 1 } else { column.wrapping_sub(1) };
         }
     }
 
-    /// The line at the end of a column of blocks, where all that the plane crosses in it is hidden: it is told as one
-    /// then. Large blocks bound little, so they are passed over only if nothing is to be told.
-    fn beyond(&mut self, which: usize, block: usize, from: f64) -> Option<usize> {
+    /// Whether a column of blocks may be passed over, because all that the plane crosses in it is hidden: it is told as
+    /// one then. Large blocks bound little, so they are passed over only if nothing is to be told; small ones
+    /// also if nothing new is.
+    fn is_over(&mut self, which: usize, block: usize, posts: [&Post; 2]) -> bool {
         let plane = &self.plane;
-        let log2 = BLOCKS_LOG2[which];
-        let line = if plane.forward { ((block + 1) << log2).min(plane.sizes[0] - 1) } else { block << log2 };
-        let to = plane.to_line(line);
         // The plane leans at most one cell a column: it crosses one block or two.
-        let row = |u: f64| (plane.minor(u).max(0.0) as usize).min(plane.sizes[1] - 2) >> log2;
-        let blocks = [from, to].map(|u| plane.sample([block, row(u)]));
+        let row = |post: &Post| (post.minor.max(0.0) as usize).min(plane.sizes[1] - 2) >> BLOCKS_LOG2[which];
+        let blocks = posts.map(|post| plane.sample([block, row(post)]));
         let [low, high] = plane.relief.bounds(which, blocks);
         if low > high {
-            return Some(line);
+            return true;
         }
-        let slopes = plane.slopes([f64::from(low), f64::from(high)], [from, to]);
+        let slopes = [lowest_slope(f64::from(low), posts), highest_slope(f64::from(high), posts)];
         if self.sky.shows(slopes) {
-            return None;
+            return false;
         }
         let share = self.sky.share(slopes);
         if share > self.sky.least {
-            if which > 0 || share > BLOCK_SHARE_MAX {
-                return None;
-            }
-            for block in blocks {
-                (self.visit)(Seen { region: Region::Block(block), slopes, share });
-            }
-        }
-        Some(line)
-    }
-
-    /// Crosses a column; whether the plane is still over the relief at its end.
-    fn column(&mut self, column: usize, [from, to]: [f64; 2]) -> bool {
-        let [low, high] = {
-            let [a, b] = [from, to].map(|u| self.plane.minor(u));
-            if a < b { [a, b] } else { [b, a] }
-        };
-        // It leans at most one cell a column, so it crosses one line between rows at most.
-        let line = low.floor() + 1.0;
-        let cross = if line < high { (line - self.plane.eye[1]) / self.plane.lean } else { to };
-        for [from, to] in [[from, cross.clamp(from, to)], [cross.clamp(from, to), to]] {
-            if from >= to {
-                continue;
-            }
-            let middle = self.plane.minor(f64::midpoint(from, to));
-            if middle < 0.0 || middle > (self.plane.sizes[1] - 1) as f64 {
+            if which > 0 {
                 return false;
             }
-            let row = (middle as usize).min(self.plane.sizes[1] - 2);
-            self.cell([column, row], [from, to]);
+            if share > BLOCK_SHARE_MAX {
+                return blocks.iter().all(|block| self.witness.knows_block(*block, share));
+            }
+            for block in blocks {
+                self.witness.note(Seen { region: Region::Block(block), slopes, share });
+            }
         }
         true
     }
 
-    /// Crosses a cell: one small triangle or two.
-    fn cell(&mut self, [k, j]: [usize; 2], [from, to]: [f64; 2]) {
-        let plane = &self.plane;
-        let corners = [[k, j], [k + 1, j], [k + 1, j + 1], [k, j + 1]].map(|c| plane.sample(c));
-        let heights = corners.map(|c| plane.relief.at(c));
-        let filled = heights.iter().filter(|h| **h != NODATA);
-        let [low, high] = filled.fold([i32::MAX, NODATA], |[low, high], h| [low.min(*h), high.max(*h)]);
-        if high == NODATA {
-            return;
+    /// Crosses a column; whether the plane is still over the relief at its end.
+    fn column(&mut self, column: usize, [from, to]: [&Post; 2]) -> bool {
+        let low = from.minor.min(to.minor);
+        // It leans at most one cell a column, so it crosses one line between rows at most.
+        let line = f64::from(floor(low) + 1);
+        if line < from.minor.max(to.minor) {
+            let cross = (line - self.plane.eye[1]) / self.plane.lean;
+            if cross > from.u && cross < to.u {
+                let cross = self.plane.post(cross);
+                return self.in_row(column, [from, &cross]) && self.in_row(column, [&cross, to]);
+            }
         }
-        let bounds = [f64::from(low), f64::from(high)];
-        let slopes = plane.slopes(bounds, [from, to]);
+        self.in_row(column, [from, to])
+    }
+
+    /// Crosses a column between lines of rows, too; whether that is over the relief.
+    fn in_row(&mut self, column: usize, [from, to]: [&Post; 2]) -> bool {
+        if from.u >= to.u {
+            return true;
+        }
+        let middle = f64::midpoint(from.minor, to.minor);
+        if middle < 0.0 || middle > (self.plane.sizes[1] - 1) as f64 {
+            return false;
+        }
+        let row = (middle as usize).min(self.plane.sizes[1] - 2);
+        self.cell([column, row], [from, to]);
+        true
+    }
+
+    /// Crosses a cell: one small triangle or two.
+    fn cell(&mut self, [k, j]: [usize; 2], [from, to]: [&Post; 2]) {
+        let plane = &self.plane;
+        let (major, minor) = (plane.major, 1 - plane.major);
+        let columns = [k, k + 1].map(|k| plane.heights.offset(major, k));
+        let rows = [j, j + 1].map(|j| plane.heights.offset(minor, j));
+        let items = plane.heights.items();
+        let places = [columns[0] + rows[0], columns[1] + rows[0], columns[1] + rows[1], columns[0] + rows[1]];
+        let heights = places.map(|i| items[i]);
+        let [a, b, c, d] = heights;
+        let high = a.max(b).max(c.max(d));
+        let mut low = a.min(b).min(c.min(d));
+        if low == NODATA {
+            if high == NODATA {
+                return;
+            }
+            low = heights.iter().copied().filter(|h| *h != NODATA).fold(high, i32::min);
+        }
+        let posts = [from, to];
+        let slopes = [lowest_slope(f64::from(low), posts), highest_slope(f64::from(high), posts)];
         if !self.sky.shows(slopes) {
+            if self.witness.knows_seen(places) {
+                return;
+            }
             let share = self.sky.share(slopes);
             if share > self.sky.least {
-                (self.visit)(Seen { region: Region::Cell(plane.sample([k, j])), slopes, share });
+                self.witness.note(Seen { region: Region::Cell(plane.sample([k, j])), slopes, share });
             }
             return;
         }
-        let local = |u: f64| {
-            let along = if plane.forward { u } else { -u };
-            [plane.eye[0] + along - k as f64, plane.minor(u) - j as f64]
-        };
+        self.triangles([k, j], heights, posts);
+    }
+
+    /// Crosses the triangles of a cell.
+    fn triangles(&mut self, [k, j]: [usize; 2], heights: [i32; 4], [from, to]: [&Post; 2]) {
+        let plane = &self.plane;
         let rising = (k + j).is_multiple_of(2);
+        let corners = [[k, j], [k + 1, j], [k + 1, j + 1], [k, j + 1]].map(|c| plane.sample(c));
+        let local = |post: &Post| [plane.eye[0] + plane.sign * post.u - k as f64, post.minor - j as f64];
         // Which side of the diagonal, and how far.
-        let side = |u: f64| {
-            let [s, t] = local(u);
-            if rising { s - t } else { s + t - 1.0 }
-        };
-        let [a, b] = [side(from), side(to)];
-        let cross = if a * b < 0.0 { from + (to - from) * a / (a - b) } else { to };
-        for ([from, to], side) in [([from, cross], if a == 0.0 { b } else { a }), ([cross, to], b)] {
-            if from >= to {
+        let side = |[s, t]: [f64; 2]| if rising { s - t } else { s + t - 1.0 };
+        let [a, b] = [side(local(from)), side(local(to))];
+        let cross = if a * b < 0.0 { plane.post(from.u + (to.u - from.u) * a / (a - b)) } else { *to };
+        let [h0, h1, h2, h3] = heights.map(f64::from);
+        for ([from, to], side) in [([from, &cross], if a == 0.0 { b } else { a }), ([&cross, to], b)] {
+            if from.u >= to.u {
                 continue;
             }
-            // The triangle's corners: the one beside the diagonal stands between its ends.
-            let [i, c, l] = match (rising, side < 0.0) {
-                (true, false) => [0, 1, 2],
-                (true, true) => [2, 3, 0],
-                (false, true) => [3, 0, 1],
-                (false, false) => [1, 2, 3],
+            // A triangle's corners, and its plane: the height at the cell's first corner, and slopes along its axes.
+            let ([i, c, l], [at, along, across]) = match (rising, side < 0.0) {
+                (true, false) => ([0, 1, 2], [h0, h1 - h0, h2 - h1]),
+                (true, true) => ([2, 3, 0], [h0, h2 - h3, h3 - h0]),
+                (false, true) => ([3, 0, 1], [h0, h1 - h0, h3 - h0]),
+                (false, false) => ([1, 2, 3], [h1 + h3 - h2, h2 - h3, h2 - h1]),
             };
             if [i, c, l].iter().any(|corner| heights[*corner] == NODATA) {
                 continue;
             }
-            // Legs run along the axes, so heights along them tell the plane.
-            let apex = f64::from(heights[c]);
-            let [leg_i, leg_l] = [i, l].map(|corner| f64::from(heights[corner]) - apex);
-            let height = |u: f64| {
-                let [s, t] = local(u);
-                // How far from the apex along either axis.
-                let [s, t] = [if c == 0 || c == 3 { s } else { 1.0 - s }, if c < 2 { t } else { 1.0 - t }];
-                // At even corners the leg to the one before runs along the minor axis.
-                if c % 2 == 0 { apex + leg_i * t + leg_l * s } else { apex + leg_i * s + leg_l * t }
-            };
-            let ends = [from, to].map(|u| self.plane.slope(height(u), u));
+            let ends = [from, to].map(|post| {
+                let [s, t] = local(post);
+                post.slope(at + along * s + across * t)
+            });
             let slopes = if ends[0] < ends[1] { ends } else { [ends[1], ends[0]] };
             let share = if self.sky.shows(slopes) {
                 self.sky.cover(slopes);
@@ -517,7 +675,7 @@ impl<F: FnMut(Seen)> Walk<'_, F> {
             };
             if share > self.sky.least {
                 let region = Region::Triangle([corners[i], corners[c], corners[l]]);
-                (self.visit)(Seen { region, slopes, share });
+                self.witness.note(Seen { region, slopes, share });
             }
         }
     }

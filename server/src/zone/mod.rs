@@ -10,6 +10,7 @@
 //! |---|---|
 //! | [`polygon`] | GeoJSON to rings in the frame's metres |
 //! | [`relief`] | the finest surface as a raster with a pyramid of blocks |
+//! | [`tiled`] | rasters whose samples lie tile by tile in memory |
 //! | [`view`] | where the eyes of a zone stand, and why that is enough |
 //! | [`cast`] | what of a relief is seen from eyes, and how well the rest is hidden |
 //!
@@ -20,6 +21,7 @@
 pub mod cast;
 pub mod polygon;
 pub mod relief;
+pub mod tiled;
 pub mod view;
 
 use crate::inspect::InspectError;
@@ -35,6 +37,7 @@ use rayon::prelude::*;
 use relief::Relief;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+use tiled::Tiled;
 use view::Ground;
 
 /// The visibility of what is hidden, unless told otherwise: errors may be twenty times as large.
@@ -43,8 +46,8 @@ pub const HIDDEN: f64 = 0.05;
 /// The angle of a pixel, unless told otherwise, in radians: that of 45 degrees over 785 pixels.
 pub const ANGLE: f64 = 1e-3;
 
-/// The least apparent width of a triangle that counts, unless told otherwise: half of that.
-pub const EPSILON: f64 = 5e-4;
+/// The least apparent width of a triangle that counts, unless told otherwise: as much, so that two rays pass a pixel.
+pub const EPSILON: f64 = ANGLE;
 
 /// Cells between eyes, unless told otherwise, ...
 const SPACING_CELLS: f64 = 4.0;
@@ -52,11 +55,11 @@ const SPACING_CELLS: f64 = 4.0;
 /// ... and the most eyes along all contours then.
 const EYES: f64 = 200.0;
 
-/// The most eyes, however told: each takes about a third of a second on 4096 x 4096 samples.
+/// The most eyes, however told.
 const EYES_MAX: usize = 1 << 16;
 
 /// Bytes of memory for a sample: its height, its share of the blocks, its visibility.
-const SAMPLE_BYTES: f64 = 5.2;
+const SAMPLE_BYTES: f64 = 5.7;
 
 /// Bytes of memory for a diamond while its layer is read: an entry of the index.
 const DIAMOND_BYTES: u64 = 50;
@@ -475,16 +478,15 @@ pub fn shares(
     eyes: &[Post],
     options: &Options,
     progress: &Progress,
-) -> Option<Vec<u8>> {
-    let [width, height] = ground.relief.size();
+) -> Option<Tiled<u8>> {
     if !ground.holds(polygons) {
         progress.advance(eyes.len() as u64);
-        return Some(vec![u8::MAX; width * height]);
+        return Some(Tiled::filled(ground.relief.size(), u8::MAX));
     }
     let placed: Vec<Eye> = eyes.iter().map(|(point, metres)| ground.eye(*point, *metres)).collect();
     let mut shares = cast::cast(&ground.relief, &optics(ground, options), &placed, progress)?;
     for rings in polygons {
-        ground.own(rings, |[x, y]| shares[y * width + x] = u8::MAX);
+        ground.own(rings, |at| shares.set(at, u8::MAX));
     }
     Some(shares)
 }
@@ -498,15 +500,17 @@ struct Tally {
 }
 
 impl Tally {
-    fn count(&mut self, shares: &[u8], floor: u8) {
-        self.samples += shares.len() as u64;
-        self.seen += shares.iter().filter(|share| **share == u8::MAX).count() as u64;
-        self.hidden += shares.iter().filter(|share| **share == floor).count() as u64;
+    fn count(&mut self, shares: &Tiled<u8>, floor: u8) {
+        for share in shares.rows() {
+            self.samples += 1;
+            self.seen += u64::from(share == u8::MAX);
+            self.hidden += u64::from(share == floor);
+        }
     }
 }
 
 /// The visibility of each diamond: the largest of its samples, borders included.
-fn mask(layer: &Layer, shares: &[u8], floor: u8, layers: usize) -> Mask {
+fn mask(layer: &Layer, shares: &Tiled<u8>, floor: u8, layers: usize) -> Mask {
     let forest = &layer.forest;
     let level = forest.levels() - 1;
     let [width, height] = layer.samples.map(i64::from);
@@ -523,7 +527,7 @@ fn mask(layer: &Layer, shares: &[u8], floor: u8, layers: usize) -> Mask {
                     clippy::cast_sign_loss,
                     reason = "within the layer"
                 )]
-                let share = shares[(y * width + x) as usize];
+                let share = shares.at([x as usize, y as usize]);
                 largest = largest.max(share);
             }
         }

@@ -1,22 +1,23 @@
-//! The finest surface of a layer as a plain raster, with the highest and lowest sample of each block of it.
+//! The finest surface of a layer as a raster, with the highest and lowest sample of each block of it.
 
+use super::tiled::Tiled;
 use crate::inspect::{self, InspectError};
 use crate::store::Store;
 use diamantina_protocol::NODATA;
 use diamantina_protocol::message::Layer;
+use rayon::prelude::*;
 use std::sync::{Mutex, PoisonError};
 
 /// Base-2 logarithms of the sides of blocks, in cells, from small to large.
-pub const BLOCKS_LOG2: [u32; 2] = [3, 6];
+pub const BLOCKS_LOG2: [u32; 3] = [2, 4, 6];
 
-/// Samples in rows from the south, with a pyramid of blocks.
+/// Heights in quanta, with a pyramid of blocks.
 ///
-/// Takes 4 bytes a sample and 1/8 more for the blocks.
+/// Takes 4 bytes a sample and 8/15 of a byte for the blocks.
 #[derive(Debug)]
 pub struct Relief {
-    size: [usize; 2],
-    heights: Vec<i32>,
-    blocks: [Blocks; 2],
+    heights: Tiled<i32>,
+    blocks: [Blocks; BLOCKS_LOG2.len()],
 }
 
 /// The lowest and highest sample of each block, its borders included; those without height do not count.
@@ -30,12 +31,24 @@ struct Blocks {
 const NOTHING: [i32; 2] = [i32::MAX, NODATA];
 
 impl Relief {
+    /// The relief of a raster of two samples at least along each axis, and [`NODATA`] beyond.
+    #[must_use]
+    pub fn new(heights: Tiled<i32>) -> Self {
+        let finest = Blocks::finest(&heights);
+        let middle = finest.coarser(BLOCKS_LOG2[1] - BLOCKS_LOG2[0]);
+        let coarsest = middle.coarser(BLOCKS_LOG2[2] - BLOCKS_LOG2[1]);
+        Self { heights, blocks: [finest, middle, coarsest] }
+    }
+
     /// The relief of `size[0]` by `size[1]` samples, two at least along each axis; `heights` in quanta, row by row
     /// from the south.
     #[must_use]
-    pub fn new(size: [usize; 2], heights: Vec<i32>) -> Self {
-        let blocks = BLOCKS_LOG2.map(|log2| Blocks::new(size, &heights, log2));
-        Self { size, heights, blocks }
+    pub fn from_rows(size: [usize; 2], heights: &[i32]) -> Self {
+        let mut tiled = Tiled::filled(size, NODATA);
+        for (i, height) in heights.iter().enumerate() {
+            tiled.set([i % size[0], i / size[0]], *height);
+        }
+        Self::new(tiled)
     }
 
     /// The finest surface of a layer, decoded chunk by chunk: some 100 MB at a time, besides the relief itself.
@@ -44,7 +57,7 @@ impl Relief {
     /// When the store is damaged.
     pub fn read(store: &Store, number: u8, layer: &Layer) -> Result<Self, InspectError> {
         let size = layer.samples.map(|s| s as usize);
-        let heights = Mutex::new(vec![NODATA; size[0] * size[1]]);
+        let heights = Mutex::new(Tiled::filled(size, NODATA));
         inspect::decode_finest(store, number, layer, |blocks| {
             let mut heights = heights.lock().unwrap_or_else(PoisonError::into_inner);
             for (d, block, _) in blocks {
@@ -53,29 +66,34 @@ impl Relief {
                     let at = local.lattice2([p, q].map(|w| i64::try_from(w).unwrap_or(0)));
                     let [x, y] = at.map(|w| usize::try_from(w).unwrap_or(usize::MAX));
                     if x < size[0] && y < size[1] {
-                        heights[y * size[0] + x] = block.height([p, q]);
+                        heights.set([x, y], block.height([p, q]));
                     }
                 }
             }
         })?;
-        Ok(Self::new(size, heights.into_inner().unwrap_or_else(PoisonError::into_inner)))
+        Ok(Self::new(heights.into_inner().unwrap_or_else(PoisonError::into_inner)))
+    }
+
+    /// The heights.
+    pub(super) fn heights(&self) -> &Tiled<i32> {
+        &self.heights
     }
 
     /// Samples along x and y.
     #[must_use]
     pub fn size(&self) -> [usize; 2] {
-        self.size
+        self.heights.size()
     }
 
-    /// Blocks of the smaller kind along x and y.
+    /// Blocks of the smallest kind along x and y.
     pub(super) fn blocks_size(&self) -> [usize; 2] {
         self.blocks[0].size
     }
 
     /// The height of a sample.
     #[must_use]
-    pub fn at(&self, [x, y]: [usize; 2]) -> i32 {
-        self.heights[y * self.size[0] + x]
+    pub fn at(&self, place: [usize; 2]) -> i32 {
+        self.heights.at(place)
     }
 
     /// Three corners of the small triangle at a place, in cells from the south-west sample and within the relief,
@@ -88,7 +106,7 @@ impl Relief {
     )]
     pub fn triangle(&self, place: [f64; 2]) -> [([usize; 2], f64); 3] {
         let [i, j]: [usize; 2] =
-            std::array::from_fn(|axis| (place[axis].max(0.0) as usize).min(self.size[axis] - 2));
+            std::array::from_fn(|axis| (place[axis].max(0.0) as usize).min(self.size()[axis] - 2));
         let [s, t] = [place[0] - i as f64, place[1] - j as f64];
         match ((i + j).is_multiple_of(2), s >= t, s + t <= 1.0) {
             (true, true, _) => [([i, j], 1.0 - s), ([i + 1, j], s - t), ([i + 1, j + 1], t)],
@@ -124,20 +142,37 @@ fn merged(a: [i32; 2], b: [i32; 2]) -> [i32; 2] {
 }
 
 impl Blocks {
-    fn new([width, height]: [usize; 2], heights: &[i32], log2: u32) -> Self {
-        let size = [width, height].map(|samples| (samples - 1).div_ceil(1 << log2));
-        let side = 1usize << log2;
-        let mut bounds = Vec::with_capacity(size[0] * size[1]);
-        for j in 0..size[1] {
-            let rows = j * side..=((j + 1) * side).min(height - 1);
-            for i in 0..size[0] {
-                let columns = i * side..=((i + 1) * side).min(width - 1);
-                let samples = rows
-                    .clone()
-                    .flat_map(|y| &heights[y * width + columns.start()..=y * width + columns.end()]);
-                let filled = samples.filter(|h| **h != NODATA);
-                bounds.push(filled.fold(NOTHING, |bounds, h| merged(bounds, [*h, *h])));
+    fn finest(heights: &Tiled<i32>) -> Self {
+        let side = 1usize << BLOCKS_LOG2[0];
+        let [width, height] = heights.size();
+        let size = [width, height].map(|samples| (samples - 1).div_ceil(side));
+        let items = heights.items();
+        let bound = |i: usize| {
+            let [x, y] = [i % size[0] * side, i / size[0] * side];
+            let mut bounds = NOTHING;
+            for y in y..=(y + side).min(height - 1) {
+                let row = heights.offset(1, y);
+                for x in x..=(x + side).min(width - 1) {
+                    let height = items[row + heights.offset(0, x)];
+                    if height != NODATA {
+                        bounds = merged(bounds, [height, height]);
+                    }
+                }
             }
+            bounds
+        };
+        let bounds = (0..size[0] * size[1]).into_par_iter().map(bound).collect();
+        Self { size, bounds }
+    }
+
+    /// Blocks with sides larger by a power of two.
+    fn coarser(&self, log2: u32) -> Self {
+        let size = self.size.map(|blocks| blocks.div_ceil(1 << log2));
+        let mut bounds = vec![NOTHING; size[0] * size[1]];
+        for (i, bound) in self.bounds.iter().enumerate() {
+            let [x, y] = [i % self.size[0], i / self.size[0]].map(|w| w >> log2);
+            let whole = &mut bounds[y * size[0] + x];
+            *whole = merged(*whole, *bound);
         }
         Self { size, bounds }
     }
@@ -152,7 +187,8 @@ mod tests {
         let (width, height) = (100usize, 70usize);
         let of = |i: usize| i32::try_from(i * 7919 % 1013).unwrap();
         let heights = (0..width * height).map(|i| if of(i) % 9 == 0 { NODATA } else { of(i) }).collect();
-        let relief = Relief::new([width, height], heights);
+        let heights: Vec<i32> = heights;
+        let relief = Relief::from_rows([width, height], &heights);
         for (which, log2) in BLOCKS_LOG2.into_iter().enumerate() {
             for y in 0..height - 1 {
                 for x in 0..width - 1 {
@@ -163,13 +199,13 @@ mod tests {
                 }
             }
         }
-        let empty = Relief::new([9, 9], vec![NODATA; 81]);
+        let empty = Relief::from_rows([9, 9], &[NODATA; 81]);
         assert_eq!(empty.bounds(0, [[0, 0], [0, 0]]), NOTHING);
     }
 
     #[test]
     fn the_surface_passes_through_its_samples_and_bends_along_its_diagonals() {
-        let relief = Relief::new([3, 2], vec![0, 10, 20, 30, 40, NODATA]);
+        let relief = Relief::from_rows([3, 2], &[0, 10, 20, 30, 40, NODATA]);
         for (place, expected) in [
             ([0.0, 0.0], Some(0.0)),
             ([1.0, 1.0], Some(40.0)),

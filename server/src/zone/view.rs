@@ -164,7 +164,7 @@ mod tests {
             let [x, y] = [(i % side) as f64, (i / side) as f64];
             waves.iter().map(|[a, b, c, h]| h * (a * x + b * y + c).sin()).sum::<f64>() as i32
         };
-        let relief = Relief::new([side, side], (0..side * side).map(height).collect());
+        let relief = Relief::from_rows([side, side], &(0..side * side).map(height).collect::<Vec<i32>>());
         Ground { relief, origin: [500.0, -300.0], cell: [10.0, 10.0], quantum: 1.0, height_offset: 7.0 }
     }
 
@@ -191,8 +191,7 @@ mod tests {
             // Close enough that what only an eye between two of them sees is within the angle of being seen.
             let eyes: Vec<Eye> = contour(&rings, 4.0).into_iter().map(|p| ground.eye(p, ceiling)).collect();
             let mut mask = cast(&ground.relief, &optics, &eyes, &Progress::hidden()).unwrap();
-            let width = ground.relief.size()[0];
-            ground.own(&rings, |[x, y]| mask[y * width + x] = 255);
+            ground.own(&rings, |at| mask.set(at, 255));
             let part = Part { ceiling, rings };
             let [mut inside, mut seen, mut missed] = [0, 0, 0];
             while inside < 12 {
@@ -208,7 +207,7 @@ mod tests {
                     walk(&ground.relief, &optics, eye, f64::from(i) / 200.0 * TAU + 1e-3, |s| {
                         if let Region::Triangle(corners) = s.region && s.share >= 1.0 && s.slopes[1] - s.slopes[0] > 1e-4 {
                             seen += 1;
-                            let share = corners.iter().map(|[x, y]| mask[y * width + x]).max();
+                            let share = corners.iter().map(|at| mask.at(*at)).max();
                             missed += i32::from(share < Some(250));
                         }
                     });

@@ -9,7 +9,7 @@
 //! once. So the cost is at most one scan of the field a level, and usually two or three in all.
 
 use super::{Criterion, Ground};
-use diamantina_protocol::bitree::{Bitree, Facet};
+use diamantina_protocol::bitree::{Bitree, Draft, Facet};
 
 /// One bit for each triangle of a grid.
 struct Queued(Vec<u64>);
@@ -30,13 +30,25 @@ impl Queued {
 #[must_use]
 pub fn top_down(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, share: f64) -> Bitree {
     let field = ground.field();
-    let mut tree = field.tree();
+    let tree = field.tree();
     let finest = 2 * u32::from(field.log2());
     let mut queued = Queued(vec![0; (4usize << finest).div_ceil(64)]);
     let mut now = tree.roots().to_vec();
-    for _ in 0..finest {
-        now.retain(|facet| criterion.error(ground, facet, tolerance) > tolerance);
-        let mut moved = Vec::new();
+    let mut draft = Draft::of(tree);
+    // How many of a point's triangles are split for their own sake; a point is the middle of those of one level.
+    let mut split_at = vec![0u8; field.heights().len()];
+    for level in 0..finest {
+        now.retain(|facet| {
+            // The middle is one of the samples, and often tells enough.
+            let middle = ground.field().slot(facet.middle());
+            criterion == Criterion::Vertical
+                && criterion.distance(ground, middle, off(ground, facet)) > Some(tolerance)
+                || criterion.error(ground, facet, tolerance) > tolerance
+        });
+        for facet in &now {
+            split_at[field.slot(facet.middle())] += 1;
+        }
+        let mut across = Vec::new();
         for facet in &now {
             let m = facet.middle();
             let off = off(ground, facet);
@@ -44,18 +56,22 @@ pub fn top_down(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, share
                 Some(distance) => distance > share * tolerance,
                 None => off != 0.0,
             };
-            if is_off && !off.is_nan() && tree.add(m, field.at(m)).is_none() {
-                moved.push(m);
+            if is_off && !off.is_nan() && draft.add(m, field.at(m)).is_none() {
+                let is_outermost = m.iter().any(|w| *w == 0 || *w == 1 << field.log2());
+                if split_at[field.slot(m)] < 2 && !is_outermost {
+                    across.extend(draft.around(m).into_iter().flatten());
+                }
             }
         }
-        let across = moved.into_iter().flat_map(|m| tree.around(m)).flatten();
-        let split: Vec<Facet> = now.iter().copied().chain(across).collect();
-        now.clear();
-        for facet in split.into_iter().filter(|facet| queued.insert(facet.path())) {
-            now.extend(tree.halves(&facet));
+        let split = std::mem::take(&mut now);
+        if level + 1 == finest {
+            break;
+        }
+        for facet in split.into_iter().chain(across).filter(|facet| queued.insert(facet.path())) {
+            now.extend(draft.halves(&facet));
         }
     }
-    tree
+    draft.finish()
 }
 
 /// How far the sample at a triangle's middle is above the hypotenuse; NaN without data.

@@ -159,7 +159,8 @@ fn any_relief() -> impl Strategy<Value = Relief> {
                 if holes > 0 && dice(holes) == 0 { NODATA } else { height }
             })
             .collect();
-        Relief::new([width, height], heights)
+        let heights: Vec<i32> = heights;
+        Relief::from_rows([width, height], &heights)
     })
 }
 
@@ -273,7 +274,7 @@ fn masks_do_not_depend_on_threads_and_hold_what_each_azimuth_shows() {
         let (x, y) = ((i % side) as f64, (i / side) as f64);
         (300.0 * (x / 11.0).sin() * (y / 17.0).cos()) as i32
     };
-    let relief = Relief::new([side, side], (0..side * side).map(height).collect());
+    let relief = Relief::from_rows([side, side], &(0..side * side).map(height).collect::<Vec<i32>>());
     let optics = optics(BEND);
     let eyes: Vec<Eye> =
         [[3.3, 70.0], [75.0, 75.5], [149.0, 0.0]].map(|p| Eye { place: p, height: 310.0 }).to_vec();
@@ -292,8 +293,8 @@ fn masks_do_not_depend_on_threads_and_hold_what_each_azimuth_shows() {
             });
         }
     }
-    assert_eq!(whole, expected);
-    let seen = whole.iter().filter(|v| **v == 255).count();
+    assert_eq!(whole.rows().collect::<Vec<u8>>(), expected);
+    let seen = whole.rows().filter(|v| *v == 255).count();
     assert!((side * side / 20..side * side * 19 / 20).contains(&seen), "{seen} of {} are seen", side * side);
     let stopped = Progress::hidden();
     stopped.stop();
@@ -302,7 +303,7 @@ fn masks_do_not_depend_on_threads_and_hold_what_each_azimuth_shows() {
 
 #[test]
 fn the_step_of_azimuth_is_half_the_least_triangle_that_counts() {
-    let relief = Relief::new([101, 101], vec![0; 101 * 101]);
+    let relief = Relief::from_rows([101, 101], &[0; 101 * 101]);
     let fine = optics(0.0);
     // The farthest corner is 1000 m east and 1300 m north.
     let ratio = 10.0 / SQRT_2 / 1000.0f64.hypot(1300.0);
@@ -312,5 +313,5 @@ fn the_step_of_azimuth_is_half_the_least_triangle_that_counts() {
     // So each triangle is crossed by a ray from anywhere.
     let eye = Eye { place: [20.4, 31.7], height: 5000.0 };
     let mask = cast(&relief, &fine, &[eye], &Progress::hidden()).unwrap();
-    assert!(mask.iter().all(|v| *v == 255), "all of a plain is seen from above");
+    assert!(mask.rows().all(|v| v == 255), "all of a plain is seen from above");
 }
