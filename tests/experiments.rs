@@ -94,3 +94,38 @@ fn an_observer_hardly_notices_that_nine_tenths_of_the_polygons_are_gone() {
     let changed = |rule: &str| number(table, row(rule, "5"), "pixels changed [%]");
     assert!(changed("view and mask") < changed("view") && changed("view") < changed("plain"));
 }
+
+#[test]
+fn a_fixed_number_of_points_takes_the_largest_errors_first() {
+    let Some(sources) = sources(&["srtm3_crops/alps_1025.tif"]) else { return };
+    let report = run("tolerances", &sources, &["--tolerances", "10", "--points", "4,50,400"]);
+    let table = report.tables.iter().find(|t| t.name == "numbers").unwrap();
+    let column = |name: &str| table.rows.iter().map(|row| number(table, row, name)).collect::<Vec<_>>();
+    assert_eq!(column("points"), [4.0, 50.0, 400.0]);
+    let errors = column("error [m]");
+    assert!(errors[0] > 2.0 * errors[1] && errors[1] > 2.0 * errors[2], "{errors:?}");
+}
+
+#[test]
+fn a_mask_leaves_a_third_of_the_triangles_and_the_skyline() {
+    let Some(sources) = sources(&["srtm3_geotiff/N46E008.tif"]) else { return };
+    // The window has the northern arm of Lago Maggiore, and mountains around it.
+    let report = run("zone", &sources, &["--samples", "1025", "--eye", "3", "--tolerances", "0.5"]);
+    let table = report.tables.iter().find(|t| t.name == "zone").unwrap();
+    let row = |mesh: &str, tolerance: &str| {
+        table.rows.iter().find(|r| r[1] == mesh && r[2].contains(tolerance)).unwrap().clone()
+    };
+    let moved = "azimuths moved by more than 1 px [%]";
+    for (mesh, tolerance, left, px) in [
+        ("curvature quadtree", "(50 %", 100.0 / 3.0, 0.0),
+        ("curvature quadtree", "(20 %", 100.0 / 3.0, 0.2),
+        ("bitree", "(0.5 %", 100.0 / 3.0, 0.0),
+    ] {
+        let row = row(mesh, tolerance);
+        assert!(number(table, &row, "left [%]") <= left, "{row:?}");
+        assert!(number(table, &row, moved) <= px, "{row:?}");
+    }
+    let seen = number(&report.tables[1], &report.tables[1].rows[0], "seen [%]");
+    assert!((5.0..40.0).contains(&seen), "{seen} %");
+    assert!(report.pictures.iter().any(|p| p.file == "0-mask.png" && p.bytes.len() > 10_000));
+}

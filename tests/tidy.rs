@@ -41,7 +41,17 @@ const SERVER: &[(&str, &[&str])] = &[
     ("zone", &["height", "inspect", "progress", "projection", "store"]),
     (
         "experiment",
-        &["canvas", "client_program", "hierarchy", "http", "ingest", "measure", "progress", "simplify"],
+        &[
+            "canvas",
+            "client_program",
+            "hierarchy",
+            "http",
+            "ingest",
+            "measure",
+            "progress",
+            "simplify",
+            "zone",
+        ],
     ),
 ];
 

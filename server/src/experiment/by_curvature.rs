@@ -86,7 +86,7 @@ fn one(
             if run.progress.is_stopping() {
                 return Err(ExperimentError::Stopped);
             }
-            let (threshold, mesh) = with_share(field, rule, share / 100.0);
+            let (threshold, mesh) = with_share(field, &rule.sums, rule.observer, share / 100.0);
             let surface = view::surface(field, &mesh);
             let seen = view::render(field, &surface, eye);
             let [changed, mean] = view::difference(&full, &seen);
@@ -149,9 +149,13 @@ fn full_polygons(field: &Field) -> f64 {
 }
 
 /// The smallest threshold, up to the last bisection, that leaves at most a share of the polygons.
-fn with_share(field: &Field, rule: &Rule, share: f64) -> (f64, Vec<[Point; 3]>) {
-    let mesh =
-        |threshold: f64| templates::triangles(&Quadtree::new(field, &rule.sums, threshold, rule.observer));
+pub(super) fn with_share(
+    field: &Field,
+    sums: &Sums,
+    observer: Option<Observer>,
+    share: f64,
+) -> (f64, Vec<[Point; 3]>) {
+    let mesh = |threshold: f64| templates::triangles(&Quadtree::new(field, sums, threshold, observer));
     let (mut low, mut high) = (1e-9f64.ln(), 1e9f64.ln());
     for _ in 0..BISECTIONS {
         let middle = f64::midpoint(low, high);

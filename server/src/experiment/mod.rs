@@ -20,6 +20,7 @@ pub mod view;
 pub mod windows;
 
 mod by_curvature;
+mod by_zone;
 mod progressive;
 mod strips;
 mod tolerances;
@@ -40,6 +41,9 @@ pub struct Options {
     /// Tolerances, percent of each window's relief
     #[arg(long, value_delimiter = ',', default_values_t = [0.0, 1.0, 2.0, 7.0, 10.0, 14.0, 50.0], value_name = "PERCENT")]
     pub(crate) tolerances: Vec<f64>,
+    /// `tolerances`: also bitrees of these numbers of points, the four corners included, the largest errors first
+    #[arg(long, value_delimiter = ',', value_name = "N")]
+    pub(crate) points: Vec<usize>,
     /// How the error of a triangle is told
     #[arg(long, value_enum, default_value_t = Criterion::Vertical)]
     pub(crate) criterion: Criterion,
@@ -48,6 +52,8 @@ pub struct Options {
     pub(crate) mask: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) flights: lod::Options,
+    #[command(flatten)]
+    pub(crate) zone: by_zone::Options,
     /// Where the observer stands, in samples from the window's south-west corner [default: the highest of its southern eighth]
     #[arg(long, value_name = "X,Y", value_parser = windows::parse_place)]
     pub(crate) observer: Option<Point>,
@@ -120,6 +126,11 @@ pub const ALL: &[Experiment] = &[
         work: Work::Windows(by_curvature::run),
     },
     Experiment {
+        name: "zone",
+        about: "what is seen from a region, what its mask saves, and whether the skyline stays",
+        work: Work::Windows(by_zone::run),
+    },
+    Experiment {
         name: "progressive",
         about: "errors against points and bytes: by level, tolerance, error; quadtree, points payloads, raster",
         work: Work::Windows(progressive::run),
@@ -159,6 +170,9 @@ pub enum ExperimentError {
     /// A plot cannot be drawn.
     #[error("plot: {0}")]
     Plot(String),
+    /// The polygon is none.
+    #[error(transparent)]
+    Polygon(#[from] crate::zone::polygon::PolygonError),
     /// The flights did not come to an end.
     #[error(transparent)]
     Lod(#[from] lod::LodError),

@@ -308,7 +308,14 @@ mod tests {
         let heights: Vec<f64> =
             (0..33 * 33u32).map(|s| f64::from(s % 33 * (s / 33) % 29 + s.wrapping_mul(40_503) % 5)).collect();
         let field = Field::new(5, heights, [30.0, 30.0]).unwrap();
-        let window = Window { source: "made".to_owned(), at: [0, 0], field, weights: None };
+        let window = Window {
+            source: "made".to_owned(),
+            at: [0, 0],
+            origin: [0.0; 2],
+            crs: None,
+            field,
+            weights: None,
+        };
         for (name, steps) in schemes(&window).unwrap() {
             assert_eq!(steps.last().unwrap().max, 0.0, "{name}");
             assert!(

@@ -6,7 +6,7 @@
 //! is measured anew, over all samples.
 
 use super::report::{Picture, Report, Table};
-use super::select::{Ground, Strategy, by_strategy, largest_error};
+use super::select::{Ground, Strategy, by_number, by_strategy, largest_error};
 use super::windows::Window;
 use super::{Criterion, ExperimentError, Run, mean_and_spread, plot, quadtree};
 use diamantina_protocol::bitree::{Bitree, strip};
@@ -87,7 +87,10 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
             run.progress.advance(1);
         }
     }
-    let tables = vec![means_table(run, &found), savings_table(run, &found), each];
+    let mut tables = vec![means_table(run, &found), savings_table(run, &found), each];
+    if !run.options.points.is_empty() {
+        tables.push(numbers_table(run)?);
+    }
     let pictures = vec![savings_plot(run, &found, strategies[0])?];
     let notes = vec![
         format!(
@@ -165,6 +168,45 @@ fn push_each(table: &mut Table, window: &Window, percent: f64, strategy: Strateg
     row.extend(all.map(|c| c.references.to_string()));
     row.extend(all.map(|c| format!("{:.3}", c.error)));
     table.push(row);
+}
+
+/// What fixed numbers of points achieve, the largest errors first.
+fn numbers_table(run: &Run<'_>) -> Result<Table, ExperimentError> {
+    let columns = [
+        "DEM",
+        "x",
+        "y",
+        "points asked",
+        "points",
+        "added",
+        "triangles",
+        "references",
+        "criterion's error",
+        "error [m]",
+    ];
+    let mut table =
+        Table::new("numbers", "Bitrees of fixed numbers of points, the largest errors first", &columns);
+    run.progress.stage("selecting", "selections", (run.windows.len() * run.options.points.len()) as u64, 0);
+    for window in run.windows {
+        let Some(ground) = Ground::new(&window.field, window.weights.as_deref()) else { continue };
+        for asked in &run.options.points {
+            if run.progress.is_stopping() {
+                return Err(ExperimentError::Stopped);
+            }
+            let tree = by_number(&ground, run.options.criterion, *asked);
+            let c = counts(&ground, &tree, tree.points().1);
+            let own = largest_error(&ground, run.options.criterion, &tree);
+            let mut row = vec![window.source.clone()];
+            row.extend(
+                [window.at[0] as usize, window.at[1] as usize, *asked, c.transmitted].map(|n| n.to_string()),
+            );
+            row.extend([c.added, c.triangles, c.references].map(|n| n.to_string()));
+            row.extend([own, c.error].map(|error| format!("{error:.3}")));
+            table.push(row);
+            run.progress.advance(1);
+        }
+    }
+    Ok(table)
 }
 
 fn means_table(run: &Run<'_>, found: &BTreeMap<(usize, Strategy), Vec<Outcome>>) -> Table {

@@ -127,7 +127,8 @@ fn sample(field: &Field, heights: &[f64], [x, y]: [f64; 2]) -> Option<(f64, [f64
     (!h.is_nan()).then_some((h, [east, north], nearest))
 }
 
-fn shade([east, north]: [f64; 2], distance: f64) -> u8 {
+/// The shade of a slope, in metres a metre, at a distance as a share of the farthest.
+pub(super) fn shade([east, north]: [f64; 2], distance: f64) -> u8 {
     let normal = 1.0 / (1.0 + east * east + north * north).sqrt();
     let light = (normal * (LIGHT[2] - LIGHT[0] * east - LIGHT[1] * north)).max(0.0);
     let fog = 0.6 * distance.min(1.0);

@@ -10,6 +10,7 @@ use super::field::Field;
 use crate::ingest::{self, Source};
 use crate::progress::Progress;
 use diamantina_protocol::bintree::Point;
+use diamantina_protocol::message::Crs;
 use std::path::{Path, PathBuf};
 
 /// Shares of inner samples that are as high as their four neighbours, for ground that is partly flat.
@@ -56,6 +57,10 @@ pub struct Window {
     pub source: String,
     /// South-west sample.
     pub at: Point,
+    /// Frame coordinates of that sample, metres.
+    pub origin: [f64; 2],
+    /// The frame's system of coordinates, if the source says.
+    pub crs: Option<Crs>,
     /// Heights.
     pub field: Field,
     /// Weights of samples, if there is a mask.
@@ -110,7 +115,9 @@ pub(super) fn read(
             };
             let weights = mask.as_ref().map(|m| weights(m, at, log2)).transpose()?;
             let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-            windows.push(Window { source: name, at, field, weights });
+            let grid = source.grid();
+            let origin = [0, 1].map(|k| grid.origin[k] + f64::from(at[k]) * grid.cell[k]);
+            windows.push(Window { source: name, at, origin, crs: grid.frame_crs(), field, weights });
         }
         source.check_nodata()?;
     }

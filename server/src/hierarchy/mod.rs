@@ -32,7 +32,7 @@ use crate::progress::Progress;
 use crate::store::Writer;
 use coding::fine_step;
 use diamantina_protocol::bintree::Forest;
-use diamantina_protocol::message::{Crs, Frame, Kind, Scene};
+use diamantina_protocol::message::{Frame, Kind, Scene};
 use diamantina_protocol::points::{Coding, Rule};
 use index::Sums;
 use plan::Plan;
@@ -208,13 +208,7 @@ fn run(
 
 /// The frame of a source's grid.
 fn frame(grid: &Grid) -> Frame {
-    let crs = grid.crs.as_ref().map(|crs| {
-        let per_metre = [crs.step[0] / grid.cell[0], crs.step[1] / grid.cell[1]];
-        let origin =
-            [crs.origin[0] - grid.origin[0] * per_metre[0], crs.origin[1] - grid.origin[1] * per_metre[1]];
-        Crs { name: crs.name.clone(), proj4: crs.proj4.clone(), origin, per_metre }
-    });
-    Frame { crs, vertical_unit: "metre".to_owned() }
+    Frame { crs: grid.frame_crs(), vertical_unit: "metre".to_owned() }
 }
 
 fn report(grid: &Grid, scene: Scene, stats: &Stats, sums: Sums, started: Instant) -> Report {

@@ -177,6 +177,19 @@ pub struct Grid {
     pub resampled: bool,
 }
 
+impl Grid {
+    /// The system of coordinates and how a frame with this grid's metres lies in it.
+    #[must_use]
+    pub fn frame_crs(&self) -> Option<diamantina_protocol::message::Crs> {
+        let crs = self.crs.as_ref()?;
+        let per_metre = [crs.step[0] / self.cell[0], crs.step[1] / self.cell[1]];
+        let origin =
+            [crs.origin[0] - self.origin[0] * per_metre[0], crs.origin[1] - self.origin[1] * per_metre[1]];
+        let (name, proj4) = (crs.name.clone(), crs.proj4.clone());
+        Some(diamantina_protocol::message::Crs { name, proj4, origin, per_metre })
+    }
+}
+
 /// A coordinate reference system and how the lattice lies in it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Crs {

@@ -50,10 +50,10 @@ pub const ANGLE: f64 = 1e-3;
 pub const EPSILON: f64 = ANGLE;
 
 /// Cells between eyes, unless told otherwise, ...
-const SPACING_CELLS: f64 = 4.0;
+pub const SPACING_CELLS: f64 = 4.0;
 
 /// ... and the most eyes along all contours then.
-const EYES: f64 = 200.0;
+pub const EYES: f64 = 200.0;
 
 /// The most eyes, however told.
 const EYES_MAX: usize = 1 << 16;
