@@ -37,6 +37,7 @@ fn layer() -> Layer {
         bytes: 1,
         resampled: false,
         errors: "exact".into(),
+        tin: None,
     }
 }
 

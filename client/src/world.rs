@@ -134,6 +134,7 @@ fn build(name: &str, kind: Kind, forest: Forest, cell: [f64; 2], height: fn(u32,
         bytes: payloads.values().map(|p| p.len() as u64).sum(),
         resampled: false,
         errors: "bound".into(),
+        tin: None,
     };
     Built { layer, entries, payloads, diamonds }
 }

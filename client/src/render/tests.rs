@@ -90,6 +90,7 @@ impl World {
             bytes: 0,
             resampled: false,
             errors: "exact".into(),
+            tin: None,
         };
         let mut surfaces: HashMap<Diamond, Arc<Surface>> = HashMap::new();
         for (d, payload) in payloads {
