@@ -12,6 +12,7 @@ mod motion;
 use super::*;
 use crate::camera::FOV_Y;
 use crate::drawing::Moving;
+use crate::encoding::Encoding;
 use crate::morph::{self, Change, Moment, Morphs, Sight};
 use crate::picture::Picture;
 use crate::surface::Surface;
@@ -34,6 +35,7 @@ const PLAIN: Look = Look {
     haze: 0.0,
     exaggeration: 1.0,
     show_levels: false,
+    wireframe: false,
 };
 
 /// A layer with all surfaces of its forest, decoded from payloads as a client does.
@@ -96,7 +98,7 @@ impl World {
         for (d, payload) in payloads {
             let surface = {
                 let parents: Vec<_> = forest.parents(d).map(|p| (p, &*surfaces[&p])).collect();
-                Surface::split(&layer, d, &parents, &payload).unwrap()
+                Surface::split(Encoding::Points, &layer, d, &parents, &payload).unwrap()
             };
             surfaces.insert(d, Arc::new(surface));
         }
