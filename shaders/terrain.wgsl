@@ -24,6 +24,19 @@ struct Motion {
     @location(9) start: i32,
 }
 
+// A vertex of irregular triangles.
+struct Corner {
+    // Lattice steps from the diamond's centre.
+    @location(0) place: vec2<i32>,
+    // Height in quanta, and the normal's east and north.
+    @location(1) height: i32,
+    @location(2) normal: vec2<f32>,
+    // The instance's: the centre relative to the reference point. The others are as above.
+    @location(3) origin: vec2<i32>,
+    @location(4) axes: vec4<i32>,
+    @location(5) about: vec3<i32>,
+}
+
 struct Shaded {
     @builtin(position) @invariant clip: vec4<f32>,
     // xy: the normal's east and north. z: metres up from the eye. w: metres from the eye.
@@ -31,21 +44,25 @@ struct Shaded {
     @location(1) level: f32,
 }
 
-// A point drawn `lift` quanta above its own height. Up to the conversion to f32 all is exact, and from there on a
-// function of the lattice point, the height and the lift alone: so two diamonds give a point that they share the same
-// bits, whether they move or not.
-fn shaded(vertex: Vertex, lift: f32, normal: vec2<f32>) -> Shaded {
-    let p = vec2<i32>(vertex.place);
-    let lattice = vertex.origin + ((vertex.axes.xy * p.x + vertex.axes.zw * p.y) >> vec2<u32>(1u));
+// A lattice point, relative to the reference point, drawn `lift` quanta above its own height. Up to the conversion to
+// f32 all is exact, and from there on a function of the lattice point, the height and the lift alone: so two diamonds
+// give a point that they share the same bits, whether they move or not.
+fn placed(lattice: vec2<i32>, height: i32, lift: f32, normal: vec2<f32>, level: i32) -> Shaded {
     let across = vec2<f32>(lattice) * layer.cell + layer.offset;
-    let still = f32(vertex.height - layer.height) * layer.quantum + layer.up_offset;
+    let still = f32(height - layer.height) * layer.quantum + layer.up_offset;
     let up = select(still + lift * layer.quantum, still, lift == 0.0);
     let from_eye = vec3<f32>(across, up);
     return Shaded(
         frame.clip_from_eye * vec4<f32>(from_eye, 1.0),
         vec4<f32>(normal, up, length(from_eye)),
-        f32(vertex.about.x),
+        f32(level),
     );
+}
+
+fn shaded(vertex: Vertex, lift: f32, normal: vec2<f32>) -> Shaded {
+    let p = vec2<i32>(vertex.place);
+    let lattice = vertex.origin + ((vertex.axes.xy * p.x + vertex.axes.zw * p.y) >> vec2<u32>(1u));
+    return placed(lattice, vertex.height, lift, normal, vertex.about.x);
 }
 
 @vertex
@@ -62,6 +79,11 @@ fn terrain_morph_vertex(vertex: Vertex, motion: Motion) -> Shaded {
     let on_the_way = motion.lift.x + (motion.lift.y - motion.lift.x) * weight;
     let lift = select(on_the_way, motion.lift.y, age >= vertex.about.z);
     return shaded(vertex, lift, mix(motion.from_normal, motion.to_normal, weight));
+}
+
+@vertex
+fn tin_vertex(corner: Corner) -> Shaded {
+    return placed(corner.origin + corner.place, corner.height, 0.0, corner.normal, corner.about.x);
 }
 
 // Linear interpolation between the colours on both sides of t.
@@ -118,4 +140,10 @@ fn terrain_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
         albedo = mix(albedo, level_tint(round(shaded.level)), 0.5);
     }
     return encoded(mix(lit(albedo, normal), frame.horizon.rgb, haze_to(shaded.about.z, shaded.about.w)));
+}
+
+// The sides of triangles.
+@fragment
+fn wire_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
+    return encoded(mix(vec3<f32>(0.02), frame.horizon.rgb, haze_to(shaded.about.z, shaded.about.w)));
 }

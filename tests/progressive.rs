@@ -6,6 +6,7 @@ use crate::truth::{Check, Samples, Verdict};
 use crate::world::{Dice, Faults, Proxy, World, build, options, programs, write_raw};
 use diamantina_client::camera::Camera;
 use diamantina_client::cut::{self, Ask};
+use diamantina_client::encoding::Encoding;
 use diamantina_client::sight::Sight;
 use diamantina_client::terrain::{self, Terrain};
 use diamantina_client::{fetch, headless};
@@ -273,6 +274,7 @@ fn every_prefix_covers_the_forest_once_without_cracks() {
     let camera = Camera { eye, target: eye - DVec3::Z, fov_y: 2.7, size: [1380, 768] };
     let ask = Ask {
         layer: &layer,
+        encoding: Encoding::Points,
         camera: &camera,
         exaggeration: 1.0,
         tolerance_pixels: 1e-9,

@@ -5,9 +5,10 @@ use crate::world::{Dice, Faults, Proxy, World, build, options, write_raw};
 use diamantina_client::camera::Camera;
 use diamantina_client::cut::{self, Ask};
 use diamantina_client::drawing::DrawItem;
+use diamantina_client::encoding::Encoding;
 use diamantina_client::headless;
 use diamantina_client::sight::Sight;
-use diamantina_client::surface::Surface;
+use diamantina_client::surface::{self, Surface};
 use diamantina_client::terrain::{self, Terrain};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::{Block, Diamond};
@@ -60,7 +61,8 @@ pub(crate) fn load(store: &Store) -> Loaded {
         // Parents are saturated, so whatever has a height has parents that have.
         let parents: Vec<_> = forest.parents(d).map(|p| (p, Arc::clone(&surfaces[&p]))).collect();
         let parents: Vec<_> = parents.iter().map(|(p, s)| (*p, s.as_ref())).collect();
-        surfaces.insert(d, Arc::new(Surface::split(&layer, d, &parents, &payload).unwrap()));
+        surfaces
+            .insert(d, Arc::new(Surface::split(Encoding::Points, &layer, d, &parents, &payload).unwrap()));
     }
     Loaded { layer, entries, surfaces }
 }
@@ -74,7 +76,7 @@ fn edges(layer: &Layer, items: &[DrawItem]) -> (HashMap<Points, Vec<Vec<i32>>>, 
     let mut edges: HashMap<Points, Vec<Vec<i32>>> = HashMap::new();
     let mut area = 0;
     for item in items {
-        let (local, block) = (layer.forest.local(item.diamond), item.surface.block());
+        let (local, block) = (layer.forest.local(item.diamond), item.surface.points().unwrap().block());
         let n = block.segments();
         // Where centres are no points, half of a diagonal has half as many segments.
         let inner = if block.has_centres() { n } else { n / 2 };
@@ -143,7 +145,7 @@ fn any_cut_of_a_built_store_with_anything_missing_has_no_cracks() {
         // Saturation reaches a root square's width beyond the last height, so the fourth is the first empty one.
         let roots: Vec<Entry> = forest.root_diamonds().map(|root| entries[&root]).collect();
         assert!(roots.iter().any(Entry::is_empty), "an empty root: {roots:?}");
-        let largest = Surface::bytes(&forest, 0);
+        let largest = surface::Points::bytes(&forest, 0);
         let [low, high] = [layer.position([0, 0]), layer.position(layer.samples)];
         for round in 0..60 {
             // An eye somewhere above that sees everything, so that nothing is clipped.
@@ -153,6 +155,7 @@ fn any_cut_of_a_built_store_with_anything_missing_has_no_cracks() {
             let camera = Camera { eye, target: eye - DVec3::Z, fov_y: 2.7, size: [1380, 768] };
             let ask = Ask {
                 layer: &layer,
+                encoding: Encoding::Points,
                 camera: &camera,
                 exaggeration: 1.0,
                 tolerance_pixels: 0.005 * 300f64.powf(dice.roll()),

@@ -58,21 +58,22 @@ const SERVER: &[(&str, &[&str])] = &[
 /// `cut` is a pure function of what it is given; the GPU is `render`'s and the fronts'.
 const CLIENT: &[(&str, &[&str])] = &[
     ("camera", &[]),
-    ("surface", &[]),
+    ("encoding", &[]),
+    ("surface", &["encoding"]),
     ("picture", &[]),
     ("morph", &["surface"]),
     ("drawing", &["morph", "surface"]),
     ("cache", &["surface"]),
-    ("fetch", &[]),
+    ("fetch", &["encoding"]),
     ("sight", &["camera"]),
-    ("cut", &["camera", "drawing", "morph", "sight", "surface"]),
-    ("terrain", &["cache", "camera", "cut", "drawing", "fetch", "morph", "sight", "surface"]),
+    ("cut", &["camera", "drawing", "encoding", "morph", "sight", "surface"]),
+    ("terrain", &["cache", "camera", "cut", "drawing", "encoding", "fetch", "morph", "sight", "surface"]),
     ("render", &["camera", "drawing", "morph", "picture", "surface"]),
-    ("headless", &["camera", "fetch", "picture", "render", "terrain"]),
+    ("headless", &["camera", "fetch", "picture", "render", "surface", "terrain"]),
     ("viewer", &["camera", "fetch", "headless", "render", "terrain"]),
     ("web", &["viewer"]),
     // The made scene of the crate's own tests.
-    ("world", &["camera", "drawing", "surface"]),
+    ("world", &["camera", "drawing", "encoding", "surface"]),
 ];
 
 /// Lines that a file may have.

@@ -3,8 +3,9 @@
 use criterion::{Criterion, Throughput};
 use diamantina_client::camera::{Camera, FOV_Y};
 use diamantina_client::cut::{self, Ask};
+use diamantina_client::encoding::Encoding;
 use diamantina_client::sight::Sight;
-use diamantina_client::surface::Surface;
+use diamantina_client::surface::{Points, Surface};
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::Entry;
@@ -37,6 +38,7 @@ fn layer() -> Layer {
         bytes: 1,
         resampled: false,
         errors: "exact".into(),
+        tin: None,
     }
 }
 
@@ -52,9 +54,10 @@ fn main() {
     let eye = DVec3::new(500_000.0 + 9e5, 4_000_000.0 + 2e5, 9000.0);
     let camera =
         Camera { eye, target: eye + DVec3::new(1e5, 4e5, -60_000.0), fov_y: FOV_Y, size: [1380, 768] };
-    let memory_bytes = SPLITS * Surface::bytes(&layer.forest, 0);
+    let memory_bytes = SPLITS * Points::bytes(&layer.forest, 0);
     let ask = Ask {
         layer: &layer,
+        encoding: Encoding::Points,
         camera: &camera,
         exaggeration: 1.0,
         tolerance_pixels: 1e-3,
@@ -63,7 +66,8 @@ fn main() {
         memory_bytes,
     };
     let root = layer.forest.root_diamonds().next().expect("a forest has roots");
-    let surface = Arc::new(Surface::split(&layer, root, &[], &[]).expect("no bytes are a payload"));
+    let surface =
+        Arc::new(Surface::split(Encoding::Points, &layer, root, &[], &[]).expect("no bytes are a payload"));
     let ideal = cut::choose(&ask, entry);
     assert_eq!(ideal.len(), SPLITS);
     let mut group = criterion.benchmark_group("cut");

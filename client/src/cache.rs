@@ -89,7 +89,7 @@ impl Cache {
         if self.held.contains_key(&key) || !self.has_parents(&forest, key) {
             return false;
         }
-        let bytes = Surface::bytes(&forest, d.level());
+        let bytes = surface.bytes(&forest, d);
         let room = if wanted {
             // Unless it has a share in the cut, a parent could be evicted to make room for its child.
             self.touch_ancestors(&forest, key);
@@ -141,10 +141,10 @@ impl Cache {
             .collect();
         while self.bytes > goal {
             let Some(Reverse((_, key))) = leaves.pop() else { break };
-            self.held.remove(&key);
             let (layer, d) = key;
             let forest = self.forests[layer];
-            self.bytes -= Surface::bytes(&forest, d.level());
+            let Some(held) = self.held.remove(&key) else { continue };
+            self.bytes -= held.surface.bytes(&forest, d);
             for parent in forest.parents(d) {
                 let Some(held) = self.held.get_mut(&(layer, parent)) else { continue };
                 held.children -= 1;
@@ -233,7 +233,9 @@ impl Index {
 mod tests {
     use super::*;
     use crate::cut::{Ask, choose};
+    use crate::encoding::Encoding;
     use crate::sight::Sight;
+    use crate::surface::Points;
     use crate::world::{Dice, any_camera, surfaces, world};
 
     #[test]
@@ -241,7 +243,7 @@ mod tests {
         let built = &world()[0];
         let forest = built.layer.forest;
         let all = surfaces(built, |_| true);
-        let size = Surface::bytes(&forest, 0);
+        let size = Points::bytes(&forest, 0);
         let mut cache = Cache::new(vec![forest], 300 * size + size / 2);
         let mut dice = Dice(11);
         let mut evicted = 0;
@@ -249,6 +251,7 @@ mod tests {
             let camera = any_camera(&mut dice);
             let ask = Ask {
                 layer: &built.layer,
+                encoding: Encoding::Points,
                 camera: &camera,
                 exaggeration: 1.0,
                 tolerance_pixels: 0.5,
@@ -269,7 +272,7 @@ mod tests {
                     inserted += usize::from(cache.insert((0, d), Arc::clone(&all[&d]), true));
                 }
                 assert!(cache.bytes() <= cache.budget_bytes);
-                let sum: usize = cache.held.keys().map(|(_, d)| Surface::bytes(&forest, d.level())).sum();
+                let sum: usize = cache.held.keys().map(|(_, d)| Points::bytes(&forest, d.level())).sum();
                 assert_eq!(cache.bytes(), sum);
             }
             evicted += before + inserted - cache.len();

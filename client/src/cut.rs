@@ -18,6 +18,7 @@ pub use show::{Showing, show, sight};
 
 use crate::camera::{Bounds, Camera, Plane, nearest_drawn};
 use crate::drawing::DrawItem;
+use crate::encoding::Encoding;
 use crate::sight::{self, Sight};
 use crate::surface::Surface;
 use diamantina_protocol::bintree::Forest;
@@ -38,8 +39,10 @@ const NONE: u32 = u32::MAX;
 /// What is asked of a layer's cut.
 #[derive(Debug, Clone, Copy)]
 pub struct Ask<'a> {
-    /// The layer.
+    /// The layer, as it is streamed.
     pub layer: &'a Layer,
+    /// How its diamonds are encoded.
+    pub encoding: Encoding,
     /// The view.
     pub camera: &'a Camera,
     /// What heights are multiplied by; those of the camera are already.
@@ -64,6 +67,11 @@ pub struct Seen<'a> {
 }
 
 impl Ask<'_> {
+    /// Bytes of memory that the surface of a diamond is expected to take.
+    fn surface_bytes(&self, level: u32, entry: &Entry) -> usize {
+        Surface::expected_bytes(self.encoding, &self.layer.forest, level, entry.bytes)
+    }
+
     /// The box of a diamond as it is drawn.
     fn bounds(&self, d: Diamond, entry: &Entry) -> Bounds {
         bounds(self.layer, d, entry).stretched(self.exaggeration)
@@ -406,7 +414,7 @@ impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
     /// Splits a node whose parents are split.
     fn split(&mut self, number: u32) {
         let Node { diamond, entry, in_view, .. } = *self.ideal.node(number);
-        self.spent_bytes += Surface::bytes(&self.forest, diamond.level());
+        self.spent_bytes += self.ask.surface_bytes(diamond.level(), &entry);
         let mut children = [NONE; 4];
         for (slot, child) in children.iter_mut().zip(self.forest.children(diamond)) {
             if let Some(child) = child {
@@ -454,7 +462,8 @@ impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
             }
         }
         let level = |i: &u32| self.ideal.node(*i).diamond.level();
-        let bytes: usize = chain.iter().map(|i| Surface::bytes(&self.forest, level(i))).sum();
+        let bytes = |i: &u32| self.ask.surface_bytes(level(i), &self.ideal.node(*i).entry);
+        let bytes: usize = chain.iter().map(bytes).sum();
         if blocked || self.spent_bytes + bytes > self.ask.memory_bytes {
             return;
         }

@@ -3,6 +3,7 @@
 use crate::camera::{Camera, FOV_Y};
 use crate::picture::{Picture, write_png};
 use crate::render::{self, FrameStats, Look, Offscreen, RenderError};
+use crate::surface::Surface;
 use crate::terrain::{FrameView, Stats, Terrain, TerrainError};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::{Block, Diamond};
@@ -121,7 +122,15 @@ pub fn framed(terrain: &mut Terrain, size: [u32; 2], exaggeration: f64, patience
     let layers = &terrain.scene().layers;
     let mut points = Vec::new();
     for item in &view.items {
-        points.extend(points_of(&layers[item.layer], item.diamond, item.surface.block()));
+        let layer = &layers[item.layer];
+        match &*item.surface {
+            Surface::Points(here) => points.extend(points_of(layer, item.diamond, here.block())),
+            Surface::Tin(tin) => points.extend(tin.corners().iter().map(|corner| {
+                let place = |i: usize| f64::from(item.diamond.centre()[i]) + f64::from(corner.place[i]);
+                let [x, y] = [0, 1].map(|i| layer.origin[i] + layer.cell[i] * place(i));
+                DVec3::new(x, y, layer.metres(corner.height))
+            })),
+        }
     }
     if points.is_empty() { camera } else { around(&points, size, exaggeration) }
 }
@@ -230,6 +239,8 @@ pub struct PictureReport {
     pub fictitious_points: u64,
     /// Older points that were made more precise.
     pub corrected_points: u64,
+    /// Irregular triangles received.
+    pub triangles_received: u64,
     /// Triangles drawn.
     pub triangles_drawn: u64,
     /// Draw calls.
@@ -306,6 +317,7 @@ fn report(
         real_points: view.stats.points_real,
         fictitious_points: view.stats.points_fictitious,
         corrected_points: view.stats.points_corrected,
+        triangles_received: view.stats.triangles,
         triangles_drawn: frame.triangles,
         draws: frame.draws,
         seconds_to_first_picture: view.stats.first_picture_seconds,

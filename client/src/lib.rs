@@ -7,7 +7,8 @@
 //! | [`cut`] | camera and resident diamonds → what to draw and what to ask for |
 //! | [`fetch`] | requests by priority, retried, cancellable; answers as they stream in |
 //! | [`cache`] | decoded diamonds under a byte budget |
-//! | [`surface`] | a decoded diamond: heights and slopes |
+//! | [`encoding`] | points or irregular triangles: which of them is streamed |
+//! | [`surface`] | a decoded diamond: points with heights and slopes, or triangles with normals |
 //! | [`morph`] | how what is drawn moves from one cut to the next |
 //! | [`terrain`] | one frame of streaming: cut, fetch, decode, cache |
 //! | [`drawing`] | what a frame draws, as plain data |
@@ -19,6 +20,7 @@ pub mod cache;
 pub mod camera;
 pub mod cut;
 pub mod drawing;
+pub mod encoding;
 pub mod fetch;
 pub mod headless;
 pub mod morph;

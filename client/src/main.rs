@@ -2,7 +2,8 @@
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use diamantina_client::camera::{Camera, FOV_Y};
-use diamantina_client::fetch::FetchError;
+use diamantina_client::encoding::Encoding;
+use diamantina_client::fetch::{self, FetchError};
 use diamantina_client::headless::{self, Flight, FlightPath, FrameLine, PictureReport};
 use diamantina_client::morph;
 use diamantina_client::render::{self, Background, Colours, Look, Sun};
@@ -53,9 +54,9 @@ struct ViewArgs {
     /// everywhere
     #[arg(long, default_value_t = 1.0, value_name = "TIMES")]
     foveation: f64,
-    /// How diamonds are encoded
+    /// How diamonds are encoded: points take the fewest bytes, tin draws the fewest triangles
     #[arg(long, default_value = "points", value_enum)]
-    encoding: Encoding,
+    encoding: EncodingName,
     /// Ask for less where nothing is seen from this zone, while the eye is in it: errors in pixels, those reported
     /// too, then count for what is seen of them
     #[arg(long, value_name = "NAME")]
@@ -82,6 +83,9 @@ struct ViewArgs {
     /// Tint diamonds by their level
     #[arg(long)]
     show_levels: bool,
+    /// Draw the sides of triangles
+    #[arg(long)]
+    wireframe: bool,
     /// One sample a pixel: faster, with jagged edges
     #[arg(long)]
     no_antialias: bool,
@@ -96,8 +100,9 @@ enum ColourName {
 }
 
 #[derive(Clone, Copy, ValueEnum)]
-enum Encoding {
+enum EncodingName {
     Points,
+    Tin,
 }
 
 #[derive(Args)]
@@ -256,20 +261,25 @@ impl ViewArgs {
             return Err(Failure(2, format!("--foveation {}: expected a number from 1 on", self.foveation)));
         }
         let encoding = match self.encoding {
-            Encoding::Points => terrain::ENCODING.to_owned(),
+            EncodingName::Points => Encoding::Points,
+            EncodingName::Tin => Encoding::Tin,
         };
         let options = terrain::Options {
             tolerance_pixels: self.error_pixels,
             memory_bytes: self.memory << 20,
             sight: Sight { vertical: !self.sphere_error, foveation: self.foveation },
             morph_seconds,
-            encoding,
+            fetch: fetch::Options { encoding, ..fetch::Options::default() },
             zone: self.zone.clone(),
             ..terrain::Options::default()
         };
         Terrain::open(&self.url, options).map_err(|error| {
-            let wrong_use =
-                matches!(error, TerrainError::Fetch(FetchError::Address { .. }) | TerrainError::Zone { .. });
+            let wrong_use = matches!(
+                error,
+                TerrainError::Fetch(FetchError::Address { .. })
+                    | TerrainError::Zone { .. }
+                    | TerrainError::Still
+            );
             Failure(if wrong_use { 2 } else { 1 }, error.to_string())
         })
     }
@@ -290,6 +300,7 @@ impl ViewArgs {
             },
             exaggeration: self.exaggeration,
             show_levels: self.show_levels,
+            wireframe: self.wireframe,
             ..look
         }
     }
@@ -302,6 +313,9 @@ impl ViewArgs {
 fn render(args: &RenderArgs) -> Result<(), Failure> {
     let patience = Duration::try_from_secs_f64(args.timeout)
         .map_err(|_| Failure(2, format!("--timeout {}: expected seconds, 0 or more", args.timeout)))?;
+    if args.stream && matches!(args.view.encoding, EncodingName::Tin) {
+        return Err(Failure(2, "streams are of points: leave --stream or --encoding tin out".to_owned()));
+    }
     let mut terrain = args.view.open(0.0)?;
     let ViewArgs { size, exaggeration, .. } = args.view;
     let camera = match (args.eye, args.target) {

@@ -30,7 +30,7 @@
     reason = "local coordinates are at most 256, heights below 2^24 and motions shorter than 2^24 ticks"
 )]
 
-use crate::surface::{Surface, normal};
+use crate::surface::{Points, Surface, normal};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::{Block, Diamond, walk_shared};
@@ -353,7 +353,9 @@ impl Morphs {
         if *starts >= STARTS_MAX || is_full {
             return false;
         }
-        let Some(surface) = (change.surface)(d) else { return false };
+        let Some(resident) = (change.surface)(d) else { return false };
+        // Irregular triangles do not move.
+        let Some(surface) = resident.points() else { return true };
         let parents = change.layer.forest.parents(d);
         let parent = |p: Diamond| {
             let motion = self.motions.get(&p).map(Arc::as_ref);
@@ -363,7 +365,7 @@ impl Morphs {
         let start = Start {
             forest: &change.layer.forest,
             d,
-            surface: &surface,
+            surface,
             parents: &parents,
             own: self.motions.get(&d).map(Arc::as_ref),
             now: change.now,
@@ -398,7 +400,7 @@ enum Way {
 struct Start<'a> {
     forest: &'a Forest,
     d: Diamond,
-    surface: &'a Surface,
+    surface: &'a Points,
     parents: &'a [Parent<'a>],
     own: Option<&'a Motion>,
     now: Moment,
@@ -477,7 +479,8 @@ impl Start<'_> {
         let nothing = Before { height: NODATA, normal: [0; 2], record: None };
         let mut before = vec![nothing; self.surface.block().heights().len()];
         for parent in self.parents {
-            let (heights, slopes) = (parent.surface.block().heights(), parent.surface.slopes());
+            let Some(points) = parent.surface.points() else { continue };
+            let (heights, slopes) = (points.block().heights(), points.slopes());
             walk_shared(self.forest, self.d, parent.diamond, |to, from| {
                 let record = parent.motion.map(|motion| motion.records[from]);
                 before[to] = Before { height: heights[from], normal: normal(slopes[from]), record };

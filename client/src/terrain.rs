@@ -18,10 +18,11 @@ use crate::cache::{Cache, Index, Key, PAGES_MAX};
 use crate::camera::{Camera, Plane};
 use crate::cut::{self, Ask, Drawing, Ideal, Seen, Wish};
 use crate::drawing::DrawItem;
+use crate::encoding::Encoding;
 use crate::fetch::{self, Event, FetchError, Fetcher, ROOT_BYTES, Traffic, Want};
 use crate::morph::{self, Change, Moment, Morphs};
 use crate::sight::Sight;
-use crate::surface::Surface;
+use crate::surface::{Points, Surface, Tin};
 use bytes::Bytes;
 use decoders::{Decoders, Job};
 use diamantina_protocol::diamond::Diamond;
@@ -49,9 +50,6 @@ const STRAYS_MAX: usize = 256;
 /// Decoded surfaces that wait for a frame to take them: 25 MB for n = 64. The decoders pause there.
 const DONE_MAX: usize = 256;
 
-/// The encoding that this build decodes.
-pub const ENCODING: &str = "points";
-
 /// How to stream a scene.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
@@ -66,11 +64,9 @@ pub struct Options {
     pub memory_bytes: usize,
     /// Seconds that points take to move from one cut to the next, at most [`morph::SECONDS_MAX`]; 0: they jump.
     pub morph_seconds: f64,
-    /// How diamonds are encoded; only [`ENCODING`] so far.
-    pub encoding: String,
     /// The name of a zone: while the eye is in it, less is asked for where nothing is seen from there.
     pub zone: Option<String>,
-    /// How to fetch.
+    /// How to fetch, and in which encoding.
     pub fetch: fetch::Options,
 }
 
@@ -82,7 +78,6 @@ impl Default for Options {
             sight: Sight::default(),
             memory_bytes: 512 << 20,
             morph_seconds: 0.0,
-            encoding: ENCODING.to_owned(),
             zone: None,
             fetch: fetch::Options::default(),
         }
@@ -95,10 +90,11 @@ pub enum TerrainError {
     /// It cannot be fetched.
     #[error(transparent)]
     Fetch(#[from] FetchError),
-    /// Not in an encoding that this build decodes.
+    /// Not in the encoding asked for.
     #[error(
-        "layer '{layer}' is offered as {offered:?}, asked for as '{asked}', and this build decodes \
-         '{ENCODING}': build the store with --encoding {ENCODING}"
+        "layer '{layer}' is offered as {}, asked for as {asked}: build the store with --encoding points,tin, or \
+         leave --encoding {asked} out",
+        .offered.join(", ")
     )]
     Encoding {
         /// The layer.
@@ -106,8 +102,11 @@ pub enum TerrainError {
         /// Encodings that the server offers.
         offered: Vec<String>,
         /// The encoding asked for.
-        asked: String,
+        asked: &'static str,
     },
+    /// Motions of irregular triangles.
+    #[error("motions from cut to cut are of points: leave --morph or --encoding tin out")]
+    Still,
     /// There is no such zone.
     #[error(
         "scene '{scene}' has no zone '{asked}'{}",
@@ -149,6 +148,8 @@ pub struct Stats {
     pub points_fictitious: u64,
     /// Older points made more precise.
     pub points_corrected: u64,
+    /// Irregular triangles decoded.
+    pub triangles: u64,
     /// Surfaces resident.
     pub resident: usize,
     /// Bytes of memory that they take.
@@ -271,15 +272,17 @@ impl Terrain {
         if !(0.0..=morph::SECONDS_MAX).contains(&options.morph_seconds) {
             return Err(TerrainError::Morph(options.morph_seconds));
         }
+        if options.morph_seconds > 0.0 && options.fetch.encoding == Encoding::Tin {
+            return Err(TerrainError::Still);
+        }
         let opened = Instant::now();
         let (fetcher, scene) = Fetcher::open(url, options.fetch)?;
-        let unfit =
-            |layer: &&Layer| options.encoding != ENCODING || !layer.encodings.iter().any(|e| e == ENCODING);
-        if let Some(layer) = scene.layers.iter().find(unfit) {
+        let encoding = options.fetch.encoding;
+        if let Some(layer) = scene.layers.iter().find(|layer| encoding.layer(layer).is_none()) {
             return Err(TerrainError::Encoding {
                 layer: layer.name.clone(),
                 offered: layer.encodings.clone(),
-                asked: options.encoding,
+                asked: encoding.name(),
             });
         }
         let view = options.zone.as_deref().map(|name| ZoneView::fetch(&fetcher, &scene, name)).transpose()?;
@@ -298,7 +301,7 @@ impl Terrain {
             layers,
             cache,
             fetcher,
-            decoders: Decoders::start(&scene)?,
+            decoders: Decoders::start(&scene, encoding)?,
             scene,
             options,
             pending: HashMap::default(),
@@ -361,8 +364,12 @@ impl Terrain {
 
     /// Asks for all that a view needs in one request a layer, the largest errors first: on the way, each frame
     /// draws what is there, and once it has ended, frames ask for what is still missing. It is dropped where
-    /// most of it turns out not to be wanted. The camera is as for [`Terrain::frame`].
+    /// most of it turns out not to be wanted. The camera is as for [`Terrain::frame`]. Streams are of points: in
+    /// another encoding this asks for nothing.
     pub fn stream(&mut self, camera: &Camera) {
+        if self.options.fetch.encoding != Encoding::Points {
+            return;
+        }
         // A little less than the tolerance, for the rounding of both ends.
         let angle = self.options.tolerance_pixels / camera.pixels_per_radian() * (1.0 - 1e-9);
         // The server knows heights as they are: the same view, from where a camera of such heights would be.
@@ -403,6 +410,7 @@ impl Terrain {
         for (number, state) in self.layers.iter_mut().enumerate() {
             let ask = Ask {
                 layer: &self.scene.layers[number],
+                encoding: self.options.fetch.encoding,
                 camera,
                 exaggeration: self.options.exaggeration,
                 tolerance_pixels: self.options.tolerance_pixels,
@@ -468,7 +476,9 @@ impl Terrain {
             self.pending_bytes -= self.pending.remove(&key).unwrap_or(0);
             match result {
                 Ok(surface) => {
-                    let tally = surface.tally();
+                    self.fetcher.accept(fetch::Key::Diamond(number, d));
+                    let tally = surface.points().map(Points::tally).unwrap_or_default();
+                    self.stats.triangles += surface.tin().map_or(0, Tin::triangles) as u64;
                     self.stats.points_real += u64::from(tally.real);
                     self.stats.points_fictitious += u64::from(tally.fictitious);
                     self.stats.points_corrected += u64::from(tally.corrected);

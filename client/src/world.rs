@@ -2,6 +2,7 @@
 
 use crate::camera::{Camera, FOV_Y};
 use crate::drawing::DrawItem;
+use crate::encoding::Encoding;
 use crate::surface::{Surface, normal};
 use axum::Router;
 use axum::body::{Body, Bytes};
@@ -14,10 +15,11 @@ use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::index::{self, Entry};
 use diamantina_protocol::message::{
-    self, Catalogue, Frame, FrameHeader, Kind, Layer, Scene, Status, StreamAsk,
+    self, Catalogue, Frame, FrameHeader, Kind, Layer, Scene, Status, StreamAsk, TinLayer,
 };
 use diamantina_protocol::points::{self, Coding, Rule};
 use diamantina_protocol::sight;
+use diamantina_protocol::tin::{self, Patch};
 use glam::DVec3;
 use std::collections::{HashMap, HashSet};
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -31,6 +33,34 @@ pub(crate) struct Built {
     pub(crate) payloads: HashMap<Diamond, Vec<u8>>,
     /// Parents before children.
     pub(crate) diamonds: Vec<Diamond>,
+    /// The same as irregular triangles, if it is offered so.
+    pub(crate) tin: Option<BuiltTin>,
+}
+
+/// What a store would have of a layer's irregular triangles.
+pub(crate) struct BuiltTin {
+    /// As it is streamed.
+    pub(crate) layer: Layer,
+    pub(crate) entries: HashMap<Diamond, Entry>,
+    pub(crate) payloads: HashMap<Diamond, Vec<u8>>,
+    /// Parents before children.
+    pub(crate) diamonds: Vec<Diamond>,
+}
+
+impl Built {
+    fn entries_of(&self, encoding: Encoding) -> (&Forest, &HashMap<Diamond, Entry>) {
+        match (encoding, &self.tin) {
+            (Encoding::Tin, Some(tin)) => (&tin.layer.forest, &tin.entries),
+            _ => (&self.layer.forest, &self.entries),
+        }
+    }
+
+    fn payloads_of(&self, encoding: Encoding) -> (&Forest, &HashMap<Diamond, Vec<u8>>) {
+        match (encoding, &self.tin) {
+            (Encoding::Tin, Some(tin)) => (&tin.layer.forest, &tin.payloads),
+            _ => (&self.layer.forest, &self.payloads),
+        }
+    }
 }
 
 /// Hills with a coast in the east, a round lake without data, and a margin without data in the north.
@@ -41,6 +71,18 @@ fn hills(x: u32, y: u32) -> i32 {
     if fx > coast || lake || y > 490 {
         return NODATA;
     }
+    relief(x, y)
+}
+
+/// The same hills with outlines that every level's cells follow, as those of simplified triangles do: a square lake, and
+/// straight coasts.
+fn blocks(x: u32, y: u32) -> i32 {
+    let lake = (193..320).contains(&x) && (129..256).contains(&y);
+    if lake || x > 832 || y > 448 { NODATA } else { relief(x, y) }
+}
+
+fn relief(x: u32, y: u32) -> i32 {
+    let (fx, fy) = (f64::from(x), f64::from(y));
     let noise = (x.wrapping_mul(374_761_393) ^ y.wrapping_mul(668_265_263)).wrapping_mul(1_274_126_177) >> 24;
     let hills = 900.0 * (fx / 90.0).sin() * (fy / 70.0).cos() + 240.0 * (fx / 13.0).cos() * (fy / 17.0).sin();
     (hills + 3000.0) as i32 + (noise % 40) as i32
@@ -59,7 +101,11 @@ pub(crate) fn world() -> &'static [Built] {
     static WORLD: OnceLock<Vec<Built>> = OnceLock::new();
     WORLD.get_or_init(|| {
         vec![
-            build("terrain", Kind::Terrain, forest(9, 4, [2, 1], 2), [10.0, 10.0], hills),
+            with_tin(
+                build("terrain", Kind::Terrain, forest(9, 4, [2, 1], 2), [10.0, 10.0], hills),
+                forest(9, 3, [2, 1], 0),
+                blocks,
+            ),
             build("water", Kind::Water, forest(9, 3, [1, 1], 1), [10.0, 10.0], pond),
         ]
     })
@@ -134,8 +180,96 @@ fn build(name: &str, kind: Kind, forest: Forest, cell: [f64; 2], height: fn(u32,
         bytes: payloads.values().map(|p| p.len() as u64).sum(),
         resampled: false,
         errors: "bound".into(),
+        tin: None,
     };
-    Built { layer, entries, payloads, diamonds }
+    Built { layer, entries, payloads, diamonds, tin: None }
+}
+
+/// The same layer offered as irregular triangles, too.
+fn with_tin(built: Built, forest: Forest, height: fn(u32, u32) -> i32) -> Built {
+    let quantum = built.layer.quantum;
+    let diamonds: Vec<Diamond> = (0..forest.levels()).flat_map(|l| forest.diamonds(l)).collect();
+    let (mut payloads, mut entries) = (HashMap::new(), HashMap::<Diamond, Entry>::new());
+    let mut dice = Dice(77);
+    for d in diamonds.iter().rev() {
+        let regular = Patch::regular(&forest, *d, forest.segments(), |[x, y]| {
+            Some(height(x, y)).filter(|h| *h != NODATA)
+        });
+        let is_finest = d.level() + 1 == forest.levels();
+        let patch = if is_finest { regular } else { thinned(&forest, *d, &regular, &mut dice) };
+        let payload = tin::encode(&forest, *d, &patch).unwrap();
+        // Whatever is drawn lies within the range of heights.
+        let children: Vec<Entry> = forest
+            .children(*d)
+            .into_iter()
+            .flatten()
+            .map(|c| entries[&c])
+            .filter(|e| !e.is_empty())
+            .collect();
+        let lows = patch.vertices.iter().map(|v| v.height).chain(children.iter().map(|e| e.low));
+        let highs = patch.vertices.iter().map(|v| v.height).chain(children.iter().map(|e| e.high));
+        let entry = match (lows.min(), highs.max()) {
+            (Some(low), Some(high)) => {
+                let below = children.iter().map(|e| e.error_metres).fold(0.0, f32::max);
+                let error_metres = index::declared((f64::from(high - low) * quantum) as f32).max(below);
+                Entry { error_metres, low, high, bytes: payload.len() as u32 }
+            }
+            _ => Entry::EMPTY,
+        };
+        entries.insert(*d, entry);
+        payloads.insert(*d, payload);
+    }
+    let offer = TinLayer {
+        forest,
+        finest_error: 0.0,
+        triangles: 0,
+        bytes: payloads.values().map(|p| p.len() as u64).sum(),
+        patch_triangles: 0,
+        metric: "none".into(),
+        lambda: 1.0,
+        patch_error: None,
+        errors: "bound".into(),
+    };
+    let encodings = vec!["points".into(), "tin".into()];
+    let layer = Layer { encodings, tin: Some(offer), ..built.layer };
+    let streamed = Encoding::Tin.layer(&layer).unwrap();
+    Built { layer, tin: Some(BuiltTin { layer: streamed, entries, payloads, diamonds }), ..built }
+}
+
+/// A regular patch in which some cells, off the diagonals, have two triangles rather than four, cut at random.
+fn thinned(forest: &Forest, d: Diamond, regular: &Patch, dice: &mut Dice) -> Patch {
+    let local = forest.local(d);
+    let mut around: HashMap<u32, Vec<[u32; 3]>> = HashMap::new();
+    for triangle in &regular.triangles {
+        around.entry(triangle[2]).or_default().push(*triangle);
+    }
+    let turns: HashMap<u32, f64> =
+        (0..regular.vertices.len() as u32).map(|middle| (middle, dice.roll())).collect();
+    let mut patch = Patch { vertices: regular.vertices.clone(), ..Patch::default() };
+    for child in 0..4 {
+        for triangle in &regular.triangles[regular.range(child)] {
+            // Of a cell's triangles, whose third vertex is its middle, the first ones come in the order of their sides.
+            let cell = &around[&triangle[2]];
+            let middle = regular.vertices[triangle[2] as usize];
+            let [p, q] = local.local2([i64::from(middle.x), i64::from(middle.y)]);
+            let n = forest.segments() as i64;
+            let diagonal = p == q || p + q == 2 * n;
+            let is_first = cell.first() == Some(triangle);
+            let turn = turns[&triangle[2]];
+            if diagonal || cell.len() < 4 || turn < 0.4 {
+                patch.triangles.push(*triangle);
+            } else if is_first {
+                let [a, b, c, d] = std::array::from_fn(|side| cell[side][0]);
+                patch.triangles.extend(if turn < 0.7 {
+                    [[a, b, c], [a, c, d]]
+                } else {
+                    [[b, c, d], [b, d, a]]
+                });
+            }
+        }
+        patch.ends[child] = patch.triangles.len() as u32;
+    }
+    patch
 }
 
 /// What one split changes at most, and the range of heights.
@@ -179,7 +313,26 @@ pub(crate) fn surfaces(built: &Built, wanted: impl Fn(Diamond) -> bool) -> HashM
         let parents: Option<Vec<_>> =
             built.layer.forest.parents(d).map(|p| Some((p, &**surfaces.get(&p)?))).collect();
         if let Some(parents) = parents {
-            let surface = Surface::split(&built.layer, d, &parents, &built.payloads[&d]).unwrap();
+            let surface =
+                Surface::split(Encoding::Points, &built.layer, d, &parents, &built.payloads[&d]).unwrap();
+            surfaces.insert(d, Arc::new(surface));
+        }
+    }
+    surfaces
+}
+
+/// Likewise of irregular triangles.
+pub(crate) fn tin_surfaces(
+    built: &BuiltTin,
+    wanted: impl Fn(Diamond) -> bool,
+) -> HashMap<Diamond, Arc<Surface>> {
+    let mut surfaces: HashMap<Diamond, Arc<Surface>> = HashMap::new();
+    for d in built.diamonds.iter().copied().filter(|d| wanted(*d)) {
+        let parents: Option<Vec<_>> =
+            built.layer.forest.parents(d).map(|p| Some((p, &**surfaces.get(&p)?))).collect();
+        if let Some(parents) = parents {
+            let payload = &built.payloads[&d];
+            let surface = Surface::split(Encoding::Tin, &built.layer, d, &parents, payload).unwrap();
             surfaces.insert(d, Arc::new(surface));
         }
     }
@@ -198,7 +351,8 @@ impl Ground {
     pub(crate) fn new(forest: Forest, items: &[DrawItem]) -> Self {
         let mut points: HashMap<[i64; 2], (i32, u32, [i16; 2])> = HashMap::new();
         for item in items {
-            let (local, block) = (forest.local(item.diamond), item.surface.block());
+            let surface = item.surface.points().unwrap();
+            let (local, block) = (forest.local(item.diamond), surface.block());
             let n = block.segments();
             for [p, q] in block.places() {
                 // In which triangles of the split the point lies.
@@ -209,7 +363,7 @@ impl Ground {
                     continue;
                 }
                 let slot = Block::slot(n, p, q);
-                let (height, slope) = (block.heights()[slot], item.surface.slopes()[slot]);
+                let (height, slope) = (block.heights()[slot], surface.slopes()[slot]);
                 if height == NODATA {
                     continue;
                 }
@@ -299,6 +453,8 @@ pub(crate) struct Faults {
     pub(crate) absurd: f64,
     pub(crate) garbage: f64,
     pub(crate) bomb: f64,
+    /// Payloads of batches are others than they should be, and their checksums say that they are right.
+    pub(crate) forged: f64,
     /// A frame that does not belong into a stream, before any of its frames.
     pub(crate) unasked: f64,
     /// The stream begins again when it is at its end.
@@ -351,8 +507,22 @@ impl Served {
         let router = Router::new()
             .route("/scenes", get(catalogue))
             .route("/scenes/{scene}", get(description))
-            .route("/scenes/{scene}/{version}/{layer}/index/{page}", get(page))
-            .route("/scenes/{scene}/{version}/{layer}/points", get(batch))
+            .route(
+                "/scenes/{scene}/{version}/{layer}/index/{page}",
+                get(|state, path| page(Encoding::Points, state, path)),
+            )
+            .route(
+                "/scenes/{scene}/{version}/{layer}/tin/index/{page}",
+                get(|state, path| page(Encoding::Tin, state, path)),
+            )
+            .route(
+                "/scenes/{scene}/{version}/{layer}/points",
+                get(|state, path, query| batch(Encoding::Points, state, path, query)),
+            )
+            .route(
+                "/scenes/{scene}/{version}/{layer}/tin",
+                get(|state, path, query| batch(Encoding::Tin, state, path, query)),
+            )
             .route("/scenes/{scene}/{version}/{layer}/stream", get(stream))
             .with_state(Arc::clone(&state));
         let runtime =
@@ -413,6 +583,7 @@ async fn common(state: &Serving, faults: &Faults) -> Option<Response> {
 }
 
 async fn page(
+    encoding: Encoding,
     State(state): Shared,
     Path((_, _, layer, page)): Path<(String, String, String, u32)>,
 ) -> Response {
@@ -424,16 +595,18 @@ async fn page(
         return zstd::bulk::compress(&vec![0u8; 64 << 20], 1).unwrap().into_response();
     }
     let built = world().iter().find(|built| built.layer.name == layer).unwrap();
-    page_blob(built, page).into_response()
+    page_blob(built, encoding, page).into_response()
 }
 
-fn page_blob(built: &Built, page: u32) -> Vec<u8> {
-    let diamonds = index::page_diamonds(&built.layer.forest, page).unwrap();
-    let entries: Vec<Entry> = diamonds.iter().map(|d| built.entries[d]).collect();
+fn page_blob(built: &Built, encoding: Encoding, page: u32) -> Vec<u8> {
+    let (forest, entries) = built.entries_of(encoding);
+    let diamonds = index::page_diamonds(forest, page).unwrap();
+    let entries: Vec<Entry> = diamonds.iter().map(|d| entries[d]).collect();
     zstd::bulk::compress(&index::encode(&entries), 3).unwrap()
 }
 
 async fn batch(
+    encoding: Encoding,
     State(state): Shared,
     Path((_, _, layer)): Path<(String, String, String)>,
     RawQuery(query): RawQuery,
@@ -446,11 +619,17 @@ async fn batch(
     let centres = message::parse_batch(query.unwrap().strip_prefix("d=").unwrap()).unwrap();
     let mut body = Vec::new();
     for centre in centres {
-        let d = built.layer.forest.diamond(centre).unwrap();
-        let mut payload = built.payloads[&d].clone();
+        let (forest, payloads) = built.payloads_of(encoding);
+        let mut payload = payloads[&forest.diamond(centre).unwrap()].clone();
         if payload.is_empty() {
             FrameHeader::without(centre, Status::Missing).write(&mut body);
             continue;
+        }
+        if state.happens(faults.forged) {
+            // Not the header, but what it announces.
+            for byte in &mut payload[1..] {
+                *byte = byte.wrapping_mul(31) ^ 0x5a;
+            }
         }
         let mut header = FrameHeader::of(centre, &payload);
         if state.happens(faults.damaged) {
@@ -537,7 +716,7 @@ async fn stream(
                 let blob = if bomb {
                     zstd::bulk::compress(&vec![0u8; 64 << 20], 1).unwrap()
                 } else {
-                    page_blob(built, page)
+                    page_blob(built, Encoding::Points, page)
                 };
                 FrameHeader::of_page(page, &blob).write(&mut body);
                 body.extend(blob);

@@ -8,7 +8,8 @@
 //! | [`diamond`] | pairs of triangles that split together; the local grid of a diamond |
 //! | [`bitree`] | a set of points, real and fictitious, and the one triangulation it implies |
 //! | [`points`] | the progressive points of a diamond ⇄ bytes |
-//! | [`rans`] | the entropy coder under [`points`] |
+//! | [`tin`] | the irregular triangles of a diamond ⇄ bytes |
+//! | [`rans`] | the entropy coder under both |
 //! | [`index`] | pages of errors, heights and sizes, from which a client knows the cut |
 //! | [`sight`] | how large an error of heights looks |
 //! | [`message`] | routes, catalogue, batch frames |
@@ -28,6 +29,7 @@ pub mod message;
 pub mod points;
 pub mod rans;
 pub mod sight;
+pub mod tin;
 pub mod wire;
 pub mod zone;
 

@@ -106,7 +106,7 @@ pub struct Layer {
     pub max_error: f64,
     /// The largest error, in metres, of what is drawn where every diamond is split.
     pub finest_error: f32,
-    /// Encodings offered: "points".
+    /// Encodings offered: "points", "tin".
     pub encodings: Vec<String>,
     /// How `points` payloads are coded.
     pub coding: Coding,
@@ -114,6 +114,33 @@ pub struct Layer {
     pub bytes: u64,
     /// Whether heights were interpolated to the frame's grid.
     pub resampled: bool,
+    /// How errors were found: "exact" if each sample was compared at each level.
+    pub errors: String,
+    /// What there is to know of the encoding `tin`, where it is offered.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tin: Option<TinLayer>,
+}
+
+/// The encoding `tin` of a layer. Its diamonds are those of a forest of its own, over the same lattice: patches are
+/// smaller, and no level only adds precision. Its index is its own as well, since other things are drawn.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TinLayer {
+    /// The root squares, as the layer's, and patches.
+    pub forest: Forest,
+    /// The largest error, in metres, of what is drawn where every diamond is split.
+    pub finest_error: f32,
+    /// Triangles of all payloads.
+    pub triangles: u64,
+    /// Bytes of all payloads and index pages.
+    pub bytes: u64,
+    /// Triangles at which the simplification of a patch stops, above the finest level.
+    pub patch_triangles: u32,
+    /// The order of collapses: "normal" or "quadric".
+    pub metric: String,
+    /// How much the borders along nodata count in that order.
+    pub lambda: f64,
+    /// The error at which simplification stops instead, in metres, at the finest level; twice as much every two levels.
+    pub patch_error: Option<f64>,
     /// How errors were found: "exact" if each sample was compared at each level.
     pub errors: String,
 }
@@ -195,10 +222,33 @@ pub fn points_route(scene: &str, version: &str, layer: &str, [x, y]: Point) -> S
     format!("/scenes/{scene}/{version}/{layer}/points/{x}/{y}")
 }
 
+/// The path of a page of the index of `tin`.
+#[must_use]
+pub fn tin_index_route(scene: &str, version: &str, layer: &str, page: u32) -> String {
+    format!("/scenes/{scene}/{version}/{layer}/tin/index/{page}")
+}
+
+/// The path of the triangles of one diamond.
+#[must_use]
+pub fn tin_route(scene: &str, version: &str, layer: &str, [x, y]: Point) -> String {
+    format!("/scenes/{scene}/{version}/{layer}/tin/{x}/{y}")
+}
+
 /// The path and query of a batch of diamonds.
 #[must_use]
 pub fn batch_route(scene: &str, version: &str, layer: &str, centres: &[Point]) -> String {
-    let mut route = format!("/scenes/{scene}/{version}/{layer}/points?d=");
+    batch_of(format!("/scenes/{scene}/{version}/{layer}/points"), centres)
+}
+
+/// The path and query of a batch of the triangles of diamonds.
+#[must_use]
+pub fn tin_batch_route(scene: &str, version: &str, layer: &str, centres: &[Point]) -> String {
+    batch_of(format!("/scenes/{scene}/{version}/{layer}/tin"), centres)
+}
+
+/// The route with the list of diamonds.
+fn batch_of(mut route: String, centres: &[Point]) -> String {
+    route.push_str("?d=");
     for (i, [x, y]) in centres.iter().enumerate() {
         // Writing to a String cannot fail.
         let _ = write!(route, "{}{x},{y}", if i == 0 { "" } else { ";" });
@@ -517,8 +567,9 @@ mod tests {
     proptest! {
         #[test]
         fn a_batch_request_comes_back(centres in prop::collection::vec(any::<[u32; 2]>(), 1..BATCH_MAX)) {
-            let route = batch_route("s", "v", "terrain", &centres);
-            prop_assert_eq!(parse_batch(route.split_once("d=").unwrap().1), Ok(centres));
+            for route in [batch_route("s", "v", "terrain", &centres), tin_batch_route("s", "v", "terrain", &centres)] {
+                prop_assert_eq!(parse_batch(route.split_once("d=").unwrap().1), Ok(centres.clone()));
+            }
         }
 
         #[test]

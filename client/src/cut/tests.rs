@@ -1,7 +1,10 @@
 //! Cuts of made scenes from any view: closed, conforming, within their tolerance and their memory.
 
+mod tin;
+
 use super::*;
-use crate::world::{Built, Dice, above, any_camera, surfaces, world};
+use crate::surface::Points;
+use crate::world::{Built, Dice, above, any_camera, surfaces, tin_surfaces, world};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::Block;
 use std::time::Instant;
@@ -12,6 +15,7 @@ fn ask<'a>(built: &'a Built, camera: &'a Camera, tolerance_pixels: f64) -> Ask<'
     let sight = Sight::default();
     Ask {
         layer: &built.layer,
+        encoding: Encoding::Points,
         camera,
         exaggeration: 1.0,
         tolerance_pixels,
@@ -24,7 +28,8 @@ fn ask<'a>(built: &'a Built, camera: &'a Camera, tolerance_pixels: f64) -> Ask<'
 /// The three sides of a drawn triangle: lattice points with their heights, from the lesser end.
 fn sides_of(built: &Built, item: &DrawItem, side: usize) -> [Side; 3] {
     let local = built.layer.forest.local(item.diamond);
-    let (n, centres) = (item.surface.block().segments(), item.surface.block().has_centres());
+    let block = item.surface.points().unwrap().block();
+    let (n, centres) = (block.segments(), block.has_centres());
     let m = 2 * n as i64;
     let corners = [[0, 0], [m, 0], [m, m], [0, m]];
     let (a, b, centre) = (corners[side], corners[(side + 1) % 4], [m / 2, m / 2]);
@@ -35,7 +40,7 @@ fn sides_of(built: &Built, item: &DrawItem, side: usize) -> [Side; 3] {
             .map(|i| {
                 let p = [0, 1].map(|k| from[k] + (to[k] - from[k]) * i / count as i64);
                 let slot = Block::slot(n, p[0] as usize, p[1] as usize);
-                (local.lattice2(p), item.surface.block().heights()[slot])
+                (local.lattice2(p), block.heights()[slot])
             })
             .collect();
         if points[0].0 > points[count].0 {
@@ -250,12 +255,12 @@ fn memory_bounds_the_ideal_set_and_spends_itself_on_the_largest_errors() {
     let camera = above();
     let mut last = f64::INFINITY;
     let forest = &built.layer.forest;
-    let largest = Surface::bytes(forest, 0);
+    let largest = Points::bytes(forest, 0);
     for surfaces in [2, 50, 200, 800] {
         let memory_bytes = surfaces * largest;
         let ask = Ask { memory_bytes, ..ask(built, &camera, 0.1) };
         let ideal = choose(&ask, |d| Some(built.entries[&d]));
-        let bytes: usize = ideal.splits().map(|d| Surface::bytes(forest, d.level())).sum();
+        let bytes: usize = ideal.splits().map(|d| Points::bytes(forest, d.level())).sum();
         assert!(bytes <= memory_bytes && bytes * 10 >= memory_bytes * 9, "{bytes} of {memory_bytes}");
         let goal = draw(0, &ask, &ideal, |_| None).error_pixels_goal;
         assert!(goal < last);
@@ -282,7 +287,7 @@ fn without_an_index_the_roots_are_wished_for_with_their_pages_and_drawn() {
 fn a_cut_of_a_thousand_diamonds_takes_less_than_a_frame() {
     let built = &world()[0];
     let camera = above();
-    let memory_bytes = 1000 * Surface::bytes(&built.layer.forest, 0);
+    let memory_bytes = 1000 * Points::bytes(&built.layer.forest, 0);
     let ask = Ask { memory_bytes, ..ask(built, &camera, 0.1) };
     let entries: HashMap<Diamond, Entry, RandomState> = built.entries.clone().into_iter().collect();
     let surfaces = surfaces(built, |_| true);

@@ -1,6 +1,7 @@
 //! Batches: put together from wishes, and cut from a stream of bytes.
 
 use super::BATCH_BYTES;
+use crate::encoding::Encoding;
 use bytes::{Buf, Bytes, BytesMut};
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::message::{self, FrameHeader, Scene};
@@ -15,8 +16,8 @@ pub(super) struct Batch {
 }
 
 impl Batch {
-    pub(super) fn new(base: &str, scene: &Scene, layer: usize) -> Self {
-        let route = message::batch_route(&scene.name, &scene.version, &scene.layers[layer].name, &[]);
+    pub(super) fn new(base: &str, scene: &Scene, encoding: Encoding, layer: usize) -> Self {
+        let route = encoding.batch_route(scene, layer, &[]);
         Self { layer, wants: Vec::new(), bytes: 0, target_bytes: base.len() + route.len() }
     }
 

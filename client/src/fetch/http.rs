@@ -2,6 +2,7 @@
 
 use super::{FetchError, TRIES_MAX, Traffic};
 use bytes::Bytes;
+use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::index;
 use diamantina_protocol::message::{self, Catalogue, Layer, Scene};
 use diamantina_protocol::zone::{self, Mask};
@@ -71,6 +72,12 @@ fn check(scene: &Scene) -> Result<(), String> {
                 coding.levels(),
                 forest.levels()
             ));
+        }
+        if let Some(tin) = &layer.tin {
+            let same = (tin.forest.root_log2(), tin.forest.roots()) == (forest.root_log2(), forest.roots());
+            if !same || tin.forest.levels() != tin.forest.lattice_levels() || !tin.finest_error.is_finite() {
+                return Err(format!("layer '{name}': another frame for tin than for points"));
+            }
         }
         let finite = [origin[0], origin[1], layer.height_offset, heights[0], heights[1]];
         let positive = [cell[0], cell[1], layer.quantum];
@@ -173,8 +180,13 @@ impl Http {
             .map_err(|e| FetchError::Json { route: route.to_owned(), reason: e.to_string() })
     }
 
-    /// The masks of a scene's zone, one a layer.
-    pub(super) async fn masks(&self, scene: &Scene, zone: &str) -> Result<Vec<Mask>, FetchError> {
+    /// The masks of a scene's zone, one a layer, of the diamonds of these forests.
+    pub(super) async fn masks(
+        &self,
+        scene: &Scene,
+        forests: &[Forest],
+        zone: &str,
+    ) -> Result<Vec<Mask>, FetchError> {
         count(&self.traffic.round_trips, 1);
         let route = message::zone_route(&scene.name, &scene.version, zone);
         let mut tries = 0;
@@ -191,10 +203,9 @@ impl Http {
             }
         };
         let wrong = |reason: String| FetchError::Zone { zone: zone.to_owned(), reason };
-        let forests: Vec<_> = scene.layers.iter().map(|layer| layer.forest).collect();
         let bytes =
-            zstd::bulk::decompress(&blob, zone::bytes_max(&forests)).map_err(|e| wrong(e.to_string()))?;
-        zone::decode(&forests, &bytes).map_err(|e| wrong(e.to_string()))
+            zstd::bulk::decompress(&blob, zone::bytes_max(forests)).map_err(|e| wrong(e.to_string()))?;
+        zone::decode(forests, &bytes).map_err(|e| wrong(e.to_string()))
     }
 
     /// The description of the scene of this name, or of the only one.

@@ -32,6 +32,7 @@ pub use batch::ROOT_BYTES;
 pub use error::FetchError;
 pub use http::LAYERS_MAX;
 
+use crate::encoding::Encoding;
 use bytes::Bytes;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::Entry;
@@ -69,11 +70,13 @@ pub struct Options {
     pub requests_max: usize,
     /// How long a connection may be silent before the request is given up.
     pub patience: Duration,
+    /// How diamonds are encoded.
+    pub encoding: Encoding,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { requests_max: 8, patience: Duration::from_secs(15) }
+        Self { requests_max: 8, patience: Duration::from_secs(15), encoding: Encoding::default() }
     }
 }
 
@@ -137,7 +140,8 @@ pub struct Fetcher {
 
 impl Fetcher {
     /// Reads the scene's description, waiting for it, and starts. `url` is that of a scene,
-    /// `http://HOST:PORT/scenes/NAME`, or of a server with only one.
+    /// `http://HOST:PORT/scenes/NAME`, or of a server with only one. Layers that are offered in the encoding asked for
+    /// come as they are streamed in it: see [`Encoding::layer`].
     ///
     /// # Errors
     /// When there is no such scene, or it cannot be shown.
@@ -166,18 +170,26 @@ impl Fetcher {
             let _ = sender.send((http, found));
         });
         let (http, scene) = receiver.recv().map_err(|e| start(&e))?;
-        let scene = match scene {
+        let mut scene = match scene {
             Ok(scene) => scene,
             Err(e) => {
                 runtime.shutdown_background();
                 return Err(e);
             }
         };
+        let forests = scene.layers.iter().map(|layer| layer.forest).collect();
+        for layer in &mut scene.layers {
+            if let Some(streamed) = options.encoding.layer(layer) {
+                *layer = streamed;
+            }
+        }
         let requests_max = options.requests_max.clamp(1, 64);
         let (sender, events) = mpsc::channel();
         let shared = Arc::new(Shared {
             http,
             scene: scene.clone(),
+            encoding: options.encoding,
+            forests,
             requests_max,
             state: Mutex::default(),
             changed: Notify::new(),
@@ -191,7 +203,7 @@ impl Fetcher {
         Ok((Self { shared, events, seen: 0, runtime: Some(runtime) }, scene))
     }
 
-    /// The masks of one of the scene's zones, one a layer; waits for them.
+    /// The masks of one of the scene's zones, one a layer, of the diamonds of its points; waits for them.
     ///
     /// # Errors
     /// When they do not come, or are none.
@@ -203,7 +215,7 @@ impl Fetcher {
         let (shared, zone) = (Arc::clone(&self.shared), zone.to_owned());
         runtime.spawn(async move {
             // Whoever asked waits for this.
-            let _ = sender.send(shared.http.masks(&shared.scene, &zone).await);
+            let _ = sender.send(shared.http.masks(&shared.scene, &shared.forests, &zone).await);
         });
         receiver.recv().map_err(|_| stopped())?
     }
@@ -266,6 +278,11 @@ impl Fetcher {
     pub fn is_streaming(&self) -> bool {
         let state = self.shared.lock();
         !state.streams.is_empty() || state.flights.values().any(|flight| flight.stream.is_some())
+    }
+
+    /// Says that the payload that arrived for `key` was good: its failures are forgotten.
+    pub fn accept(&mut self, key: Key) {
+        self.shared.lock().failures.remove(&key);
     }
 
     /// Says that what arrived for `key` was no good. It is fetched again, after a pause.

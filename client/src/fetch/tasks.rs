@@ -4,7 +4,9 @@ use super::batch::{Batch, Frames};
 use super::http::{Http, PAGE_BYTES_MAX, count, pause, shortened};
 use super::stream::weight;
 use super::{Event, FetchError, Key, REST, TRIES_MAX, Want};
+use crate::encoding::Encoding;
 use bytes::Bytes;
+use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index;
 use diamantina_protocol::message::{self, FrameHeader, Scene, Status, StreamAsk};
@@ -18,7 +20,11 @@ use tokio::sync::Notify;
 #[derive(Debug)]
 pub(super) struct Shared {
     pub(super) http: Http,
+    /// With its layers as they are streamed.
     pub(super) scene: Scene,
+    pub(super) encoding: Encoding,
+    /// Those of the layers' points.
+    pub(super) forests: Vec<Forest>,
     pub(super) requests_max: usize,
     // A std Mutex: nothing awaits while it is held, nor does more than look through the wishes.
     pub(super) state: Mutex<State>,
@@ -160,7 +166,9 @@ impl Shared {
                 }
                 Key::Diamond(..) if !may_batch => {}
                 Key::Diamond(layer, d) => {
-                    let batch = batch.get_or_insert_with(|| Batch::new(&self.http.base, &self.scene, layer));
+                    let batch = batch.get_or_insert_with(|| {
+                        Batch::new(&self.http.base, &self.scene, self.encoding, layer)
+                    });
                     if batch.layer == layer && !batch.push(d, want.bytes) {
                         break;
                     }
@@ -201,11 +209,11 @@ impl Shared {
     }
 
     async fn fetch(&self, request: &Request) -> Result<(), FetchError> {
-        let Scene { name, version, layers, .. } = &self.scene;
+        let Scene { layers, .. } = &self.scene;
         match request {
             Request::Page(layer, number) => {
                 let layer_of = &layers[*layer];
-                let route = message::index_route(name, version, &layer_of.name, *number);
+                let route = self.encoding.index_route(&self.scene, *layer, *number);
                 let body = self.http.whole(&route, PAGE_BYTES_MAX).await?;
                 // Stops at the limit, whatever the bytes claim to become.
                 let page = zstd::bulk::decompress(&body, PAGE_BYTES_MAX)
@@ -216,7 +224,7 @@ impl Shared {
             }
             Request::Batch(layer, wants) => {
                 let centres: Vec<_> = wants.iter().map(|(d, _)| d.centre()).collect();
-                let route = message::batch_route(name, version, &layers[*layer].name, &centres);
+                let route = self.encoding.batch_route(&self.scene, *layer, &centres);
                 let mut response = self.http.get(&route).await?;
                 let mut owed: HashMap<[u32; 2], (Diamond, Option<u32>)> =
                     wants.iter().map(|want| (want.0.centre(), *want)).collect();
@@ -278,7 +286,10 @@ impl Shared {
         {
             flight.useful = true;
         }
-        state.failures.remove(&key);
+        // Whether a payload is any good is not known before it is decoded.
+        if let Key::Page(..) = key {
+            state.failures.remove(&key);
+        }
         state.serial += 1;
         let serial = state.serial;
         state.delivered.insert(key, serial);

@@ -9,7 +9,7 @@
 //!
 //! A diamond is one or two draws: its points at their own buffer, its place and axes as an instance, the
 //! index lists shared by all. One in motion has a second buffer, of the motions of its points, and a pipeline that
-//! reads it. Nothing is used that WebGL2 lacks: no storage buffers, no base vertex, no
+//! reads it; irregular triangles have vertices and index lists of their own, and theirs. Nothing is used that WebGL2 lacks: no storage buffers, no base vertex, no
 //! indirect draws. Depth is reversed and infinite, positions are relative to the eye.
 
 mod frame;
@@ -25,6 +25,7 @@ pub use offscreen::Offscreen;
 use crate::camera::{Camera, nearest_drawn};
 use crate::drawing::DrawItem;
 use crate::morph::Record;
+use crate::surface::{Corner, Surface};
 use diamantina_protocol::message::{Layer, Scene};
 use frame::{FrameUniform, LayerUniform, Reference, single};
 use glam::DVec3;
@@ -77,6 +78,8 @@ pub struct Look {
     pub exaggeration: f64,
     /// Whether to tint diamonds by level.
     pub show_levels: bool,
+    /// Whether to draw the sides of triangles.
+    pub wireframe: bool,
 }
 
 impl Default for Look {
@@ -88,6 +91,7 @@ impl Default for Look {
             haze: 1.0,
             exaggeration: 1.0,
             show_levels: false,
+            wireframe: false,
         }
     }
 }
@@ -223,9 +227,29 @@ struct Draw<'a> {
     item: &'a DrawItem,
     sides: u8,
     shares_triangles: bool,
-    moves: bool,
+    kind: Kind,
     distance: f64,
 }
+
+/// What a diamond's vertices are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Kind {
+    Points,
+    MovingPoints,
+    Corners,
+}
+
+/// How triangles are drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Mode {
+    Filled,
+    /// A little farther away than they are, so that lines along their sides are seen.
+    Behind,
+    Lines,
+}
+
+/// A pipeline for each kind.
+type Pipelines = [wgpu::RenderPipeline; 3];
 
 /// Draws frames to views that the caller owns.
 pub struct Renderer {
@@ -233,12 +257,13 @@ pub struct Renderer {
     queue: wgpu::Queue,
     options: Options,
     residents: Residents,
-    terrain: wgpu::RenderPipeline,
-    terrain_morph: wgpu::RenderPipeline,
+    filled: Pipelines,
+    /// Behind, and lines: made when they are first needed.
+    wires: Option<[Pipelines; 2]>,
+    terrain_groups: [wgpu::BindGroupLayout; 2],
     sky: wgpu::RenderPipeline,
     frame_group: wgpu::BindGroup,
     frame_uniform: wgpu::Buffer,
-    layer_layout: wgpu::BindGroupLayout,
     layers: Option<(wgpu::Buffer, wgpu::BindGroup)>,
     instances: Option<wgpu::Buffer>,
     attachments: Option<Attachments>,
@@ -284,19 +309,18 @@ impl Renderer {
             layout: &frame_layout,
             entries: &[wgpu::BindGroupEntry { binding: 0, resource: frame_uniform.as_entire_binding() }],
         });
-        let groups = [Some(&frame_layout), Some(&layer_layout)];
-        let [terrain, terrain_morph] =
-            [false, true].map(|morph| terrain_pipeline(&device, options, &groups, morph));
+        let terrain_groups = [frame_layout.clone(), layer_layout];
+        let filled = terrain_pipelines(&device, options, &terrain_groups, Mode::Filled);
         let sky = sky_pipeline(&device, options, &[Some(&frame_layout)]);
         Self {
             residents: Residents::new(options.budget_bytes),
             options: *options,
-            terrain,
-            terrain_morph,
+            filled,
+            wires: None,
+            terrain_groups,
             sky,
             frame_group,
             frame_uniform,
-            layer_layout,
             layers: None,
             instances: None,
             attachments: None,
@@ -330,7 +354,11 @@ impl Renderer {
         look: &Look,
         view: &wgpu::TextureView,
     ) -> FrameStats {
-        let uploaded_bytes = self.residents.start_frame(&self.device, layers, items);
+        let uploaded_bytes = self.residents.start_frame(&self.device, layers, items, look.wireframe);
+        if look.wireframe && self.wires.is_none() {
+            let made = |mode| terrain_pipelines(&self.device, &self.options, &self.terrain_groups, mode);
+            self.wires = Some([made(Mode::Behind), made(Mode::Lines)]);
+        }
         let draws = self.in_view(layers, camera, items, look.exaggeration);
         self.write_uniforms(layers, camera, look, &draws);
         let attachments = match self.attachments.take() {
@@ -342,7 +370,13 @@ impl Renderer {
         let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         {
             let mut pass = begin_pass(&mut encoder, &attachments, view, look, self.options.format);
-            self.draw_terrain(&mut pass, &draws, &mut stats);
+            match self.wires.as_ref().filter(|_| look.wireframe) {
+                None => self.draw_terrain(&mut pass, &draws, &self.filled, false, &mut stats),
+                Some([behind, lines]) => {
+                    self.draw_terrain(&mut pass, &draws, behind, false, &mut stats);
+                    self.draw_terrain(&mut pass, &draws, lines, true, &mut FrameStats::default());
+                }
+            }
             if look.background == Background::Sky {
                 pass.set_pipeline(&self.sky);
                 pass.set_bind_group(0, &self.frame_group, &[]);
@@ -375,11 +409,16 @@ impl Renderer {
                 let sides = item.sides & if upper { 0b1111 } else { 0b0011 };
                 let distance = bounds.distance(camera.eye);
                 let shares_triangles = resident.own.is_none();
-                Some(Draw { item, sides, shares_triangles, moves: resident.motion.is_some(), distance })
+                let kind = match &*item.surface {
+                    Surface::Tin(_) => Kind::Corners,
+                    Surface::Points(_) if resident.motion.is_some() => Kind::MovingPoints,
+                    Surface::Points(_) => Kind::Points,
+                };
+                Some(Draw { item, sides, shares_triangles, kind, distance })
             })
             .collect();
         draws.sort_by(|a, b| {
-            let key = |d: &Draw<'_>| (d.item.layer, d.moves, !d.shares_triangles);
+            let key = |d: &Draw<'_>| (d.item.layer, d.kind, !d.shares_triangles);
             key(a).cmp(&key(b)).then(a.distance.total_cmp(&b.distance))
         });
         draws
@@ -403,7 +442,7 @@ impl Renderer {
         }
         let (buffer, _) = match self.layers.take() {
             Some(old) if old.0.size() >= uniforms.len() as u64 => self.layers.insert(old),
-            _ => self.layers.insert(layer_group(&self.device, &self.layer_layout, uniforms.len())),
+            _ => self.layers.insert(layer_group(&self.device, &self.terrain_groups[1], uniforms.len())),
         };
         self.queue.write_buffer(buffer, 0, &uniforms);
 
@@ -411,7 +450,10 @@ impl Renderer {
             .iter()
             .map(|draw| {
                 let layer = draw.item.layer;
-                let local = layers[layer].forest.local(draw.item.diamond);
+                let mut local = layers[layer].forest.local(draw.item.diamond);
+                if draw.kind == Kind::Corners {
+                    local.origin = draw.item.diamond.centre().map(i64::from);
+                }
                 // Steps are at most a root square's side, 2^24.
                 let [ux, uy, vx, vy] = [local.u[0], local.u[1], local.v[0], local.v[1]]
                     .map(|step| i32::try_from(step).unwrap_or(0));
@@ -439,40 +481,56 @@ impl Renderer {
         self.queue.write_buffer(buffer, 0, bytes);
     }
 
-    fn draw_terrain(&self, pass: &mut wgpu::RenderPass<'_>, draws: &[Draw<'_>], stats: &mut FrameStats) {
+    /// Draws the triangles of the items, or the lines around them.
+    fn draw_terrain(
+        &self,
+        pass: &mut wgpu::RenderPass<'_>,
+        draws: &[Draw<'_>],
+        pipelines: &Pipelines,
+        lines: bool,
+        stats: &mut FrameStats,
+    ) {
         let (Some((_, layer_group)), Some(instances)) = (&self.layers, &self.instances) else { return };
         pass.set_bind_group(0, &self.frame_group, &[]);
-        pass.set_vertex_buffer(2, instances.slice(..));
         let (mut layer_now, mut places_now, mut triangles_now) = (None, None, None::<&Triangles>);
-        let mut moves_now = None;
+        let mut kind_now = None;
         for (draw, instance) in draws.iter().zip(0u32..) {
             let grid = self.residents.grid(draw.item);
-            let (Some(grid), Some(resident)) = (grid, self.residents.get(draw.item)) else { continue };
-            if moves_now != Some(draw.moves) {
-                moves_now = Some(draw.moves);
-                pass.set_pipeline(if draw.moves { &self.terrain_morph } else { &self.terrain });
+            let Some(resident) = self.residents.get(draw.item) else { continue };
+            let triangles = resident.own.as_ref().or(grid.map(|grid| &grid.triangles));
+            let Some(triangles) = triangles else { continue };
+            if kind_now != Some(draw.kind) {
+                kind_now = Some(draw.kind);
+                pass.set_pipeline(&pipelines[draw.kind as usize]);
+                pass.set_vertex_buffer(if draw.kind == Kind::Corners { 1 } else { 2 }, instances.slice(..));
+                places_now = None;
             }
             if layer_now != Some(draw.item.layer) {
                 layer_now = Some(draw.item.layer);
                 let offset = u32::try_from(LAYER_STRIDE * draw.item.layer).unwrap_or(0);
                 pass.set_bind_group(1, layer_group, &[offset]);
             }
-            if places_now != Some(&grid.places) {
+            if let Some(grid) = grid.filter(|grid| places_now != Some(&grid.places)) {
                 places_now = Some(&grid.places);
                 pass.set_vertex_buffer(0, grid.places.slice(..));
             }
-            let triangles = resident.own.as_ref().unwrap_or(&grid.triangles);
             if !triangles_now.is_some_and(|now| std::ptr::eq(now, triangles)) {
                 triangles_now = Some(triangles);
-                pass.set_index_buffer(triangles.indices.slice(..), wgpu::IndexFormat::Uint16);
+                let indices = if lines { triangles.lines.as_ref() } else { None };
+                pass.set_index_buffer(
+                    indices.unwrap_or(&triangles.indices).slice(..),
+                    wgpu::IndexFormat::Uint16,
+                );
             }
-            pass.set_vertex_buffer(1, resident.points.slice(..));
+            pass.set_vertex_buffer(u32::from(draw.kind != Kind::Corners), resident.points.slice(..));
             if let Some(motion) = &resident.motion {
                 pass.set_vertex_buffer(3, motion.records.slice(..));
             }
             for range in runs(&triangles.sides, draw.sides) {
                 stats.draws += 1;
                 stats.triangles += u64::from((range.end - range.start) / 3);
+                // Each index of a triangle begins a line of two.
+                let range = if lines { 2 * range.start..2 * range.end } else { range };
                 pass.draw_indexed(range, 0, instance..instance + 1);
             }
         }
@@ -588,27 +646,57 @@ const INSTANCE: &[wgpu::VertexAttribute] =
 const RECORD: &[wgpu::VertexAttribute] =
     &wgpu::vertex_attr_array![6 => Float32x2, 7 => Snorm16x2, 8 => Snorm16x2, 9 => Sint32];
 
-/// The pipeline of diamonds that stand still, or of those that move.
-fn terrain_pipeline(
+const CORNER: &[wgpu::VertexAttribute] =
+    &wgpu::vertex_attr_array![0 => Sint32x2, 1 => Sint32, 2 => Snorm16x2];
+
+/// The pipelines of diamonds that stand still, of those that move, and of irregular triangles: in the order of [`Kind`].
+fn terrain_pipelines(
     device: &wgpu::Device,
     options: &Options,
-    groups: &[Option<&wgpu::BindGroupLayout>],
-    morph: bool,
-) -> wgpu::RenderPipeline {
+    groups: &[wgpu::BindGroupLayout; 2],
+    mode: Mode,
+) -> Pipelines {
     let layout = |stride: usize, step_mode, attributes| {
         Some(wgpu::VertexBufferLayout { array_stride: stride as u64, step_mode, attributes })
     };
     let (vertex, instance) = (wgpu::VertexStepMode::Vertex, wgpu::VertexStepMode::Instance);
-    let buffers = [
+    let points = [
         layout(4, vertex, PLACE),
         layout(size_of::<SurfacePoint>(), vertex, POINT),
         layout(size_of::<Instance>(), instance, INSTANCE),
         layout(size_of::<Record>(), vertex, RECORD),
     ];
-    let (name, buffers) = if morph { ("terrain_morph", &buffers[..]) } else { ("terrain", &buffers[..3]) };
+    let corners =
+        [layout(size_of::<Corner>(), vertex, CORNER), layout(size_of::<Instance>(), instance, INSTANCE)];
+    let fragment = if mode == Mode::Lines { "wire_fragment" } else { "terrain_fragment" };
+    let groups = groups.each_ref().map(Some);
     // Both faces are drawn: terrain seen from below is terrain still.
-    let entries = [&format!("{name}_vertex"), "terrain_fragment"];
-    pipeline(device, options, groups, entries, TERRAIN_WGSL, buffers, wgpu::CompareFunction::Greater)
+    let made = |vertex, buffers: &[_]| {
+        let compare = match mode {
+            Mode::Lines => wgpu::CompareFunction::GreaterEqual,
+            Mode::Filled | Mode::Behind => wgpu::CompareFunction::Greater,
+        };
+        let depth = Depth { compare, write: true, behind: mode == Mode::Behind };
+        let topology = match mode {
+            Mode::Lines => wgpu::PrimitiveTopology::LineList,
+            Mode::Filled | Mode::Behind => wgpu::PrimitiveTopology::TriangleList,
+        };
+        pipeline(device, options, &groups, [vertex, fragment], TERRAIN_WGSL, buffers, depth, topology)
+    };
+    [
+        made("terrain_vertex", &points[..3]),
+        made("terrain_morph_vertex", &points),
+        made("tin_vertex", &corners),
+    ]
+}
+
+/// What a pipeline does with depth.
+#[derive(Debug, Clone, Copy)]
+struct Depth {
+    compare: wgpu::CompareFunction,
+    write: bool,
+    /// Whether to move triangles away by a few steps of depth, and more where they are steep.
+    behind: bool,
 }
 
 fn sky_pipeline(
@@ -618,10 +706,13 @@ fn sky_pipeline(
 ) -> wgpu::RenderPipeline {
     // Infinitely far, so equal to the cleared depth and behind all else.
     let entries = ["sky_vertex", "sky_fragment"];
-    pipeline(device, options, groups, entries, SKY_WGSL, &[], wgpu::CompareFunction::GreaterEqual)
+    let depth = Depth { compare: wgpu::CompareFunction::GreaterEqual, write: false, behind: false };
+    let topology = wgpu::PrimitiveTopology::TriangleList;
+    pipeline(device, options, groups, entries, SKY_WGSL, &[], depth, topology)
 }
 
 /// A pipeline with these entry points of a vertex and a fragment shader.
+#[allow(clippy::too_many_arguments, reason = "a pipeline is made of so many things, each of its own type")]
 fn pipeline(
     device: &wgpu::Device,
     options: &Options,
@@ -629,7 +720,8 @@ fn pipeline(
     [vertex, fragment]: [&str; 2],
     source: &str,
     buffers: &[Option<wgpu::VertexBufferLayout<'_>>],
-    depth_compare: wgpu::CompareFunction,
+    depth: Depth,
+    topology: wgpu::PrimitiveTopology,
 ) -> wgpu::RenderPipeline {
     let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
         label: Some(vertex),
@@ -649,13 +741,18 @@ fn pipeline(
             compilation_options: wgpu::PipelineCompilationOptions::default(),
             buffers,
         },
-        primitive: wgpu::PrimitiveState::default(),
+        primitive: wgpu::PrimitiveState { topology, ..Default::default() },
         depth_stencil: Some(wgpu::DepthStencilState {
             format: DEPTH,
-            depth_write_enabled: Some(depth_compare == wgpu::CompareFunction::Greater),
-            depth_compare: Some(depth_compare),
+            depth_write_enabled: Some(depth.write),
+            depth_compare: Some(depth.compare),
             stencil: wgpu::StencilState::default(),
-            bias: wgpu::DepthBiasState::default(),
+            // Depth is reversed: less is farther away.
+            bias: if depth.behind {
+                wgpu::DepthBiasState { constant: -8, slope_scale: -1.0, clamp: 0.0 }
+            } else {
+                wgpu::DepthBiasState::default()
+            },
         }),
         multisample: wgpu::MultisampleState { count: options.samples, ..Default::default() },
         fragment: Some(wgpu::FragmentState {

@@ -1,13 +1,14 @@
 //! Surfaces on the GPU, under a budget of bytes.
 //!
-//! A surface takes 8 bytes a point (66 kB for n = 64), if it has nodata, its own index lists (up to 98 kB), and, as
-//! long as it moves, 20 bytes a point (166 kB). Those that the present frame draws always stay; of the others, the longest unseen go first.
+//! A grid takes 8 bytes a point (66 kB for n = 64), if it has nodata, its own index lists (up to 98 kB), and, as
+//! long as it moves, 20 bytes a point (166 kB). Irregular triangles take 16 bytes a vertex and 6 a triangle. The lines
+//! around triangles, once they are drawn, take twice as much as their index lists. Those that the present frame draws always stay; of the others, the longest unseen go first.
 
 use super::triangles::{self, Form, Lists};
 use crate::camera::Bounds;
 use crate::drawing::DrawItem;
 use crate::morph::Motion;
-use crate::surface::{Surface, normal};
+use crate::surface::{Points, Surface, Tin, normal};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::message::Layer;
@@ -39,15 +40,17 @@ pub(super) struct Triangles {
     pub(super) indices: wgpu::Buffer,
     /// Where each side's list lies.
     pub(super) sides: [Range<u32>; 4],
+    /// The lines around the triangles, if they are wanted: for each index two, from its vertex to the next one's.
+    pub(super) lines: Option<wgpu::Buffer>,
 }
 
 /// A surface on the GPU.
 pub(super) struct Resident {
     /// Which surface it is: the weak pointer keeps the address from being used again.
     surface: Weak<Surface>,
-    /// A [`SurfacePoint`] a slot.
+    /// A [`SurfacePoint`] a slot; of irregular triangles the [`crate::surface::Corner`]s.
     pub(super) points: wgpu::Buffer,
-    /// Its own index lists, if it has nodata.
+    /// Its own index lists, if it has nodata or irregular triangles.
     pub(super) own: Option<Triangles>,
     /// The motion of its points in the last frame that drew it.
     pub(super) motion: Option<MotionBuffer>,
@@ -91,25 +94,39 @@ impl Residents {
         self.by_key.get(&(item.layer, item.diamond))
     }
 
+    /// What an item shares with others of its form: nothing where its triangles are irregular.
     pub(super) fn grid(&self, item: &DrawItem) -> Option<&Grid> {
-        self.by_form.get(&Form::of(item.surface.block()))
+        self.by_form.get(&Form::of(item.surface.points()?.block()))
     }
 
     /// Starts a frame that draws these items: uploads those that are not there yet, and drops others if
     /// they exceed the budget. Returns the bytes uploaded. Items of unknown layers are passed over.
-    pub(super) fn start_frame(&mut self, device: &wgpu::Device, layers: &[Layer], items: &[DrawItem]) -> u64 {
+    pub(super) fn start_frame(
+        &mut self,
+        device: &wgpu::Device,
+        layers: &[Layer],
+        items: &[DrawItem],
+        wires: bool,
+    ) -> u64 {
         self.frame += 1;
         let mut uploaded_bytes = 0;
         for item in items {
             let Some(layer) = layers.get(item.layer) else { continue };
-            let form = Form::of(item.surface.block());
-            if form.segments != layer.forest.segments_at(item.diamond.level()) {
-                continue;
+            if let Some(points) = item.surface.points() {
+                let form = Form::of(points.block());
+                if form.segments != layer.forest.segments_at(item.diamond.level()) {
+                    continue;
+                }
+                let grid = self.by_form.entry(form).or_insert_with(|| Grid::new(device, form, wires));
+                if wires && grid.triangles.lines.is_none() {
+                    *grid = Grid::new(device, form, wires);
+                }
             }
             let key = (item.layer, item.diamond);
-            self.by_form.entry(form).or_insert_with(|| Grid::new(device, form));
+            let lacks_lines = |own: &Triangles| wires && own.lines.is_none();
             if let Some(resident) = self.by_key.get_mut(&key)
                 && std::ptr::eq(resident.surface.as_ptr(), Arc::as_ptr(&item.surface))
+                && !resident.own.as_ref().is_some_and(lacks_lines)
             {
                 resident.last_frame = self.frame;
                 let old_bytes = resident.bytes;
@@ -117,7 +134,7 @@ impl Residents {
                 self.bytes = self.bytes + resident.bytes - old_bytes;
                 continue;
             }
-            let mut resident = Resident::upload(device, layer, item, self.frame);
+            let mut resident = Resident::upload(device, layer, item, self.frame, wires);
             resident.move_as(device, item);
             uploaded_bytes += resident.bytes;
             self.bytes += resident.bytes;
@@ -149,47 +166,55 @@ impl Residents {
 }
 
 impl Grid {
-    fn new(device: &wgpu::Device, form: Form) -> Self {
+    fn new(device: &wgpu::Device, form: Form, wires: bool) -> Self {
         let places = device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
             label: Some("places"),
             contents: bytemuck::cast_slice(&triangles::places(form)),
             usage: wgpu::BufferUsages::VERTEX,
         });
-        Self { places, triangles: Triangles::new(device, triangles::lists(form, |_| true)) }
+        Self { places, triangles: Triangles::new(device, triangles::lists(form, |_| true), wires) }
     }
 }
 
 impl Triangles {
-    fn new(device: &wgpu::Device, lists: Lists) -> Self {
-        // Buffers are whole numbers of 4 bytes.
+    fn new(device: &wgpu::Device, lists: Lists, wires: bool) -> Self {
         let mut indices = lists.indices;
+        let lines = wires.then(|| {
+            let around = |t: &[u16]| [t[0], t[1], t[1], t[2], t[2], t[0]];
+            let lines: Vec<u16> = indices.chunks_exact(3).flat_map(around).collect();
+            device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+                label: Some("lines"),
+                contents: bytemuck::cast_slice(&lines),
+                usage: wgpu::BufferUsages::INDEX,
+            })
+        });
+        // Buffers are whole numbers of 4 bytes.
         indices.resize(indices.len().next_multiple_of(2), 0);
         let indices = device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
             label: Some("triangles"),
             contents: bytemuck::cast_slice(&indices),
             usage: wgpu::BufferUsages::INDEX,
         });
-        Self { indices, sides: lists.sides }
+        Self { indices, sides: lists.sides, lines }
+    }
+
+    /// Bytes of GPU memory that they take.
+    fn bytes(&self) -> u64 {
+        self.indices.size() + self.lines.as_ref().map_or(0, wgpu::Buffer::size)
     }
 }
 
 impl Resident {
-    fn upload(device: &wgpu::Device, layer: &Layer, item: &DrawItem, frame: u64) -> Self {
-        let surface = &item.surface;
-        let heights = surface.block().heights();
-        let points: Vec<SurfacePoint> =
-            heights.iter().zip(surface.slopes()).map(|(h, slope)| point(*h, *slope)).collect();
-        let points = device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
-            label: Some("surface"),
-            contents: bytemuck::cast_slice(&points),
-            usage: wgpu::BufferUsages::VERTEX,
-        });
-        let own = surface.has_nodata().then(|| Triangles::new(device, triangles::lists_of(surface.block())));
-        let bytes = points.size() + own.as_ref().map_or(0, |t| t.indices.size());
+    fn upload(device: &wgpu::Device, layer: &Layer, item: &DrawItem, frame: u64, wires: bool) -> Self {
+        let (points, own, range) = match &*item.surface {
+            Surface::Points(points) => upload_points(device, points, wires),
+            Surface::Tin(tin) => upload_tin(device, tin, wires),
+        };
+        let bytes = points.size() + own.as_ref().map_or(0, Triangles::bytes);
         // Lone points make no triangles, and an empty buffer cannot be drawn from.
         let is_empty = own.as_ref().is_some_and(|t| t.indices.size() == 0);
-        let bounds = if is_empty { None } else { bounds(layer, item.diamond, heights) };
-        let surface = Arc::downgrade(surface);
+        let bounds = range.filter(|_| !is_empty).map(|range| bounds(layer, item.diamond, range));
+        let surface = Arc::downgrade(&item.surface);
         Self { surface, points, own, motion: None, bounds, bytes, last_frame: frame }
     }
 
@@ -201,7 +226,8 @@ impl Resident {
             return 0;
         }
         self.bytes -= self.motion.take().map_or(0, |old| old.records.size());
-        let Some(motion) = wanted.filter(|m| m.records().len() == item.surface.slopes().len()) else {
+        let slots = item.surface.points().map(|points| points.slopes().len());
+        let Some(motion) = wanted.filter(|m| slots == Some(m.records().len())) else {
             return 0;
         };
         let records = device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
@@ -228,12 +254,43 @@ fn point(height: i32, slope: [f32; 2]) -> SurfacePoint {
     SurfacePoint { height: if height == NODATA { 0 } else { height }, normal: normal(slope) }
 }
 
-fn bounds(layer: &Layer, diamond: Diamond, heights: &[i32]) -> Option<Bounds> {
-    let valid = || heights.iter().copied().filter(|h| *h != NODATA);
-    let (lowest, highest) = (layer.metres(valid().min()?), layer.metres(valid().max()?));
+/// Vertices, their own index lists, and the lowest and highest of their heights.
+type Uploaded = (wgpu::Buffer, Option<Triangles>, Option<[i32; 2]>);
+
+fn upload_points(device: &wgpu::Device, points: &Points, wires: bool) -> Uploaded {
+    let heights = points.block().heights();
+    let all: Vec<SurfacePoint> =
+        heights.iter().zip(points.slopes()).map(|(h, slope)| point(*h, *slope)).collect();
+    let own = points.has_nodata().then(|| Triangles::new(device, triangles::lists_of(points.block()), wires));
+    let range = range(heights.iter().copied().filter(|h| *h != NODATA));
+    (vertices(device, bytemuck::cast_slice(&all)), own, range)
+}
+
+fn upload_tin(device: &wgpu::Device, tin: &Tin, wires: bool) -> Uploaded {
+    let lists = Lists { indices: tin.indices().to_vec(), sides: tin.sides().clone() };
+    let range = range(tin.corners().iter().map(|corner| corner.height));
+    let own = Triangles::new(device, lists, wires);
+    (vertices(device, bytemuck::cast_slice(tin.corners())), Some(own), range)
+}
+
+fn vertices(device: &wgpu::Device, contents: &[u8]) -> wgpu::Buffer {
+    device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+        label: Some("surface"),
+        contents,
+        usage: wgpu::BufferUsages::VERTEX,
+    })
+}
+
+fn range(heights: impl Iterator<Item = i32> + Clone) -> Option<[i32; 2]> {
+    Some([heights.clone().min()?, heights.max()?])
+}
+
+/// The box around a diamond's points of these heights.
+fn bounds(layer: &Layer, diamond: Diamond, heights: [i32; 2]) -> Bounds {
+    let [lowest, highest] = heights.map(|h| layer.metres(h));
     let [south_west, north_east] = layer.forest.bounds(diamond).map(|p| layer.position(p));
-    Some(Bounds {
+    Bounds {
         min: DVec3::new(south_west[0], south_west[1], lowest),
         max: DVec3::new(north_east[0], north_east[1], highest),
-    })
+    }
 }

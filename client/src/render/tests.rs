@@ -12,6 +12,7 @@ mod motion;
 use super::*;
 use crate::camera::FOV_Y;
 use crate::drawing::Moving;
+use crate::encoding::Encoding;
 use crate::morph::{self, Change, Moment, Morphs, Sight};
 use crate::picture::Picture;
 use crate::surface::Surface;
@@ -21,6 +22,7 @@ use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::message::Kind;
 use diamantina_protocol::points::{self, Coding, Rule};
+use diamantina_protocol::tin::{self, Patch};
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
@@ -34,6 +36,7 @@ const PLAIN: Look = Look {
     haze: 0.0,
     exaggeration: 1.0,
     show_levels: false,
+    wireframe: false,
 };
 
 /// A layer with all surfaces of its forest, decoded from payloads as a client does.
@@ -90,13 +93,33 @@ impl World {
             bytes: 0,
             resampled: false,
             errors: "exact".into(),
+            tin: None,
         };
         let mut surfaces: HashMap<Diamond, Arc<Surface>> = HashMap::new();
         for (d, payload) in payloads {
             let surface = {
                 let parents: Vec<_> = forest.parents(d).map(|p| (p, &*surfaces[&p])).collect();
-                Surface::split(&layer, d, &parents, &payload).unwrap()
+                Surface::split(Encoding::Points, &layer, d, &parents, &payload).unwrap()
             };
+            surfaces.insert(d, Arc::new(surface));
+        }
+        Self { layer, surfaces }
+    }
+
+    /// The same layer, with irregular triangles: those of the regular patches of fewer segments.
+    fn tin(forest: Forest, cell: f64, height: impl Fn(u32, u32) -> i32) -> Self {
+        let Self { layer, .. } = Self::new(forest, cell, &height);
+        let layer = Layer { forest: Forest::new(6, 2, forest.roots()).unwrap(), ..layer };
+        assert_eq!(layer.forest.size(), forest.size(), "made for forests of this size");
+        let forest = layer.forest;
+        let mut surfaces: HashMap<Diamond, Arc<Surface>> = HashMap::new();
+        for d in (0..forest.levels()).flat_map(|level| forest.diamonds(level)) {
+            let patch = Patch::regular(&forest, d, forest.segments(), |[x, y]| {
+                Some(height(x, y)).filter(|h| *h != NODATA)
+            });
+            let payload = tin::encode(&forest, d, &patch).unwrap();
+            let parents: Vec<_> = forest.parents(d).map(|p| (p, &*surfaces[&p])).collect();
+            let surface = Surface::split(Encoding::Tin, &layer, d, &parents, &payload).unwrap();
             surfaces.insert(d, Arc::new(surface));
         }
         Self { layer, surfaces }
@@ -215,15 +238,23 @@ fn rough(x: u32, y: u32) -> i32 {
 #[test]
 fn the_whole_forest_is_covered_and_nothing_else() {
     // Heights fall to 0 at the border, gently enough that nothing leans over the outline.
-    let forest = Forest::new(5, 3, [2, 1]).unwrap().with_precision(3).unwrap();
+    let forest = Forest::new(6, 4, [2, 1]).unwrap().with_precision(3).unwrap();
     let [w, h] = forest.size();
     let to_border = |x: u32, y: u32| x.min(y).min(w - x).min(h - y).cast_signed();
-    let world = World::new(forest, 30.0, |x, y| rough(x, y).min(60 * to_border(x, y)));
+    let height = |x: u32, y: u32| rough(x, y).min(60 * to_border(x, y));
+    for world in [World::new(forest, 30.0, height), World::tin(forest, 30.0, height)] {
+        assert_covered(&world);
+    }
+}
+
+/// Each picture shows terrain just where the forest is.
+fn assert_covered(world: &World) {
+    let forest = world.layer.forest;
     let camera = world.overhead([320, 240]);
     let (a, b) =
         (pixel_of(&camera, world.place(0.0, 1.0, 0.0)), pixel_of(&camera, world.place(1.0, 0.0, 0.0)));
     for level in 1..=forest.levels() {
-        let picture = picture(&world, &camera, &world.level(level), &PLAIN);
+        let picture = picture(world, &camera, &world.level(level), &PLAIN);
         let mut inside = 0;
         for y in 0..240 {
             for x in 0..320 {
@@ -245,16 +276,18 @@ fn the_whole_forest_is_covered_and_nothing_else() {
 
 #[test]
 fn mixed_levels_have_no_cracks() {
-    let world = World::new(Forest::new(6, 2, [3, 2]).unwrap().with_precision(3).unwrap(), 30.0, rough);
+    let forest = Forest::new(6, 2, [3, 2]).unwrap().with_precision(3).unwrap();
+    let (points, tin) = (World::new(forest, 30.0, rough), World::tin(forest, 30.0, rough));
     let camera = Camera {
-        eye: world.place(0.5, 0.25, 900.0),
-        target: world.place(0.5, 0.5, 100.0),
+        eye: points.place(0.5, 0.25, 900.0),
+        target: points.place(0.5, 0.5, 100.0),
         fov_y: 0.5,
         size: [640, 400],
     };
-    for seed in 0..6 {
+    for seed in 0..12 {
+        let world = if seed % 2 == 0 { &points } else { &tin };
         let items = world.random_cut(seed, 5 + seed % 3);
-        let picture = picture(&world, &camera, &items, &PLAIN);
+        let picture = picture(world, &camera, &items, &PLAIN);
         let holes = (0..400).flat_map(|y| (0..640).map(move |x| (x, y)));
         let holes: Vec<_> = holes.filter(|(x, y)| is_background(&picture, *x, *y)).collect();
         assert!(holes.is_empty(), "seed {seed}: {} holes, first {:?}", holes.len(), holes[0]);
@@ -278,47 +311,56 @@ fn mean(picture: &Picture, x: f64, y: f64) -> [f64; 3] {
 #[test]
 fn north_is_up_and_east_is_right() {
     // A high plateau in the north-east, the rest low.
-    let forest = Forest::new(5, 3, [1, 1]).unwrap();
-    let world = World::new(forest, 3000.0, |x, y| if x > 18 && y > 18 { 35_000 } else { 0 });
-    let picture = picture(&world, &world.overhead([300, 300]), &world.level(4), &PLAIN);
-    let corners = [(0.65, 0.35), (0.35, 0.35), (0.35, 0.65), (0.65, 0.65)].map(|(x, y)| mean(&picture, x, y));
-    assert!(corners[0].iter().all(|c| *c > 190.0), "summits are white: {corners:?}");
-    for low in &corners[1..] {
-        assert!(low[1] > low[0] * 1.2 && low[1] > low[2] * 1.2, "lowlands are green: {corners:?}");
+    let forest = Forest::new(6, 4, [1, 1]).unwrap();
+    let height = |x, y| if x > 36 && y > 36 { 35_000 } else { 0 };
+    for world in [World::new(forest, 1500.0, height), World::tin(forest, 1500.0, height)] {
+        let picture = picture(&world, &world.overhead([300, 300]), &world.level(4), &PLAIN);
+        let corners =
+            [(0.65, 0.35), (0.35, 0.35), (0.35, 0.65), (0.65, 0.65)].map(|(x, y)| mean(&picture, x, y));
+        assert!(corners[0].iter().all(|c| *c > 190.0), "summits are white: {corners:?}");
+        for low in &corners[1..] {
+            assert!(low[1] > low[0] * 1.2 && low[1] > low[2] * 1.2, "lowlands are green: {corners:?}");
+        }
     }
 }
 
 #[test]
 fn light_comes_from_the_north_west() {
     // A cone: its north-western face looks at the sun.
-    let forest = Forest::new(5, 3, [1, 1]).unwrap();
-    let world = World::new(forest, 30.0, |x, y| {
-        let (dx, dy) = (f64::from(x) - 16.0, f64::from(y) - 16.0);
-        5000 - (dx.hypot(dy) * 200.0) as i32
-    });
+    let forest = Forest::new(6, 4, [1, 1]).unwrap();
+    let height = |x, y| {
+        let (dx, dy) = (f64::from(x) - 32.0, f64::from(y) - 32.0);
+        5000 - (dx.hypot(dy) * 100.0) as i32
+    };
     let look = Look { colours: Colours::Flat, ..PLAIN };
-    let picture = picture(&world, &world.overhead([300, 300]), &world.level(4), &look);
-    let [north_west, south_east] = [(0.4, 0.4), (0.6, 0.6)].map(|(x, y)| mean(&picture, x, y)[1]);
-    assert!(north_west > south_east + 60.0, "{north_west} {south_east}");
+    let light = [World::new(forest, 15.0, height), World::tin(forest, 15.0, height)].map(|world| {
+        let picture = picture(&world, &world.overhead([300, 300]), &world.level(4), &look);
+        [(0.4, 0.4), (0.6, 0.6)].map(|(x, y)| mean(&picture, x, y)[1])
+    });
+    assert!(light.iter().all(|[north_west, south_east]| *north_west > south_east + 60.0), "{light:?}");
+    // Both encodings are lit alike.
+    assert!((0..2).all(|i| (light[0][i] - light[1][i]).abs() < 4.0), "{light:?}");
 }
 
 #[test]
 fn nodata_stays_background() {
-    let forest = Forest::new(5, 3, [1, 1]).unwrap();
-    let hole = |x: u32, y: u32| (10..=20).contains(&x) && (12..=22).contains(&y);
-    let world = World::new(forest, 30.0, |x, y| if hole(x, y) { NODATA } else { 300 });
-    let camera = world.overhead([300, 300]);
-    for items in [world.level(4), world.level(2), world.random_cut(3, 6)] {
-        let picture = picture(&world, &camera, &items, &PLAIN);
-        let at = |x: f64, y: f64| {
-            let [px, py] = pixel_of(&camera, world.place(x / 32.0, y / 32.0, 30.0));
-            is_background(&picture, px as u32, py as u32)
-        };
-        for (x, y) in [(15.0, 17.0), (10.2, 12.2), (19.8, 21.8)] {
-            assert!(at(x, y), "no terrain in the hole at {x} {y}");
-        }
-        for (x, y) in [(2.0, 17.0), (30.0, 17.0), (15.0, 2.0), (15.0, 30.0)] {
-            assert!(!at(x, y), "terrain at {x} {y}");
+    let forest = Forest::new(6, 4, [1, 1]).unwrap();
+    let hole = |x: u32, y: u32| (20..=40).contains(&x) && (24..=44).contains(&y);
+    let height = |x, y| if hole(x, y) { NODATA } else { 300 };
+    for world in [World::new(forest, 15.0, height), World::tin(forest, 15.0, height)] {
+        let camera = world.overhead([300, 300]);
+        for items in [world.level(world.layer.forest.levels()), world.level(3), world.random_cut(3, 6)] {
+            let picture = picture(&world, &camera, &items, &PLAIN);
+            let at = |x: f64, y: f64| {
+                let [px, py] = pixel_of(&camera, world.place(x / 64.0, y / 64.0, 30.0));
+                is_background(&picture, px as u32, py as u32)
+            };
+            for (x, y) in [(30.0, 34.0), (20.4, 24.4), (39.6, 43.6)] {
+                assert!(at(x, y), "no terrain in the hole at {x} {y}");
+            }
+            for (x, y) in [(4.0, 34.0), (60.0, 34.0), (30.0, 4.0), (30.0, 60.0)] {
+                assert!(!at(x, y), "terrain at {x} {y}");
+            }
         }
     }
 }
@@ -345,6 +387,45 @@ fn lone_points_draw_nothing() {
     for level in 1..=4 {
         let picture = picture(&world, &camera, &world.level(level), &PLAIN);
         assert!((0..64).all(|i| is_background(&picture, i, i)), "level {level}");
+    }
+}
+
+#[test]
+fn wires_lie_on_the_sides_of_triangles_and_nowhere_else() {
+    let forest = Forest::new(6, 4, [1, 1]).unwrap();
+    for world in [World::new(forest, 30.0, |_, _| 300), World::tin(forest, 30.0, |_, _| 300)] {
+        let camera = world.overhead([400, 400]);
+        let items = world.level(1);
+        let look = Look { colours: Colours::Flat, wireframe: true, ..PLAIN };
+        let picture = picture(&world, &camera, &items, &look);
+        let shade = |x: f64, y: f64| {
+            let [px, py] = pixel_of(&camera, world.place(x / 64.0, y / 64.0, 30.0));
+            picture.pixel([px as u32, py as u32]).unwrap()[1]
+        };
+        // Cells of the root: 4 wide for points, 16 for triangles. Their diagonals are sides, too.
+        let cell = if items[0].surface.tin().is_some() { 16.0 } else { 4.0 };
+        let (mut dark, mut light) = (0, 0);
+        for i in 0..(64.0 / cell) as i32 {
+            let from = f64::from(i) * cell;
+            // A wire is a pixel wide: one of those around it.
+            let near = [-0.2, -0.1, 0.0, 0.1, 0.2].map(|off| shade(from + off, 0.3 * cell));
+            dark += i32::from(i > 0 && near.iter().any(|c| *c < 60));
+            light += i32::from(shade(from + 0.2 * cell, 0.5 * cell) > 100);
+        }
+        let cells = (64.0 / cell) as i32;
+        assert_eq!((dark, light), (cells - 1, cells));
+        let holes = (60..340).flat_map(|y| (60..340).map(move |x| (x, y)));
+        assert_eq!(holes.filter(|(x, y)| is_background(&picture, *x, *y)).count(), 0);
+        // Seen from aside, wires do not sink into the ground.
+        let low =
+            Camera { eye: world.place(0.5, -0.4, 300.0), target: world.place(0.5, 0.5, 30.0), ..camera };
+        let dark_of = |look: &Look| {
+            let picture = self::picture(&world, &low, &items, look);
+            let pixels = (0..400).flat_map(|y| (0..400).map(move |x| [x, y]));
+            pixels.filter(|p| picture.pixel(*p).is_some_and(|c| c[1] < 60 && c[0] < 60)).count()
+        };
+        let plain = Look { wireframe: false, ..look };
+        assert!(dark_of(&look) > 1000 && dark_of(&plain) == 0, "{} {}", dark_of(&look), dark_of(&plain));
     }
 }
 

@@ -2,11 +2,11 @@
 
 use super::DONE_MAX;
 use crate::cache::Key;
-use crate::surface::Surface;
+use crate::encoding::Encoding;
+use crate::surface::{Surface, SurfaceError};
 use bytes::Bytes;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::message::Scene;
-use diamantina_protocol::points::DecodeError;
 use foldhash::fast::RandomState;
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -25,7 +25,7 @@ impl Job {
     }
 }
 
-pub(super) type Decoded = (Key, Result<Arc<Surface>, DecodeError>);
+pub(super) type Decoded = (Key, Result<Arc<Surface>, SurfaceError>);
 
 /// Threads that decode payloads whose parents are there, and hold the others.
 #[derive(Debug)]
@@ -37,6 +37,7 @@ pub(super) struct Decoders {
 #[derive(Debug)]
 struct Bench {
     scene: Arc<Scene>,
+    encoding: Encoding,
     state: Mutex<Jobs>,
     changed: Condvar,
 }
@@ -54,9 +55,13 @@ struct Jobs {
 }
 
 impl Decoders {
-    pub(super) fn start(scene: &Arc<Scene>) -> std::io::Result<Self> {
-        let shared =
-            Arc::new(Bench { scene: Arc::clone(scene), state: Mutex::default(), changed: Condvar::new() });
+    pub(super) fn start(scene: &Arc<Scene>, encoding: Encoding) -> std::io::Result<Self> {
+        let shared = Arc::new(Bench {
+            scene: Arc::clone(scene),
+            encoding,
+            state: Mutex::default(),
+            changed: Condvar::new(),
+        });
         let count = std::thread::available_parallelism()?.get();
         let mut decoders = Self { shared, threads: Vec::with_capacity(count) };
         for _ in 0..count {
@@ -144,7 +149,7 @@ impl Bench {
             let parents: Vec<(Diamond, &Surface)> =
                 job.parents.iter().filter_map(|(parent, s)| Some((*parent, s.as_deref()?))).collect();
             let layer_of = &self.scene.layers[layer];
-            let result = Surface::split(layer_of, d, &parents, &job.payload).map(Arc::new);
+            let result = Surface::split(self.encoding, layer_of, d, &parents, &job.payload).map(Arc::new);
             drop(job);
             jobs = self.lock();
             jobs.running -= 1;

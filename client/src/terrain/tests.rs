@@ -116,7 +116,7 @@ fn a_stream_of_a_scene_that_is_gone_is_noticed() {
 #[test]
 fn a_stream_for_a_view_that_moved_away_or_that_memory_cannot_hold_is_dropped() {
     let served = Served::start(1, Faults { slow: 1.0, ..Faults::default() });
-    let memory_bytes = 100 * Surface::bytes(&world()[0].layer.forest, 0);
+    let memory_bytes = 100 * Points::bytes(&world()[0].layer.forest, 0);
     let mut terrain = open(&served, Options { memory_bytes, ..Options::default() });
     terrain.stream(&above());
     let view = terrain.settle(&above(), MINUTE);
@@ -179,7 +179,7 @@ fn from_the_first_picture_on_something_is_always_drawn_and_it_gets_better() {
 #[test]
 fn a_flight_in_little_memory_stays_within_it_and_never_shows_nothing() {
     let served = Served::start(1, Faults::default());
-    let memory_bytes = 400 * Surface::bytes(&world()[0].layer.forest, 0);
+    let memory_bytes = 400 * Points::bytes(&world()[0].layer.forest, 0);
     let mut terrain = open(&served, Options { memory_bytes, ..Options::default() });
     terrain.settle(&above(), MINUTE);
     let mut dice = Dice(5);
@@ -386,10 +386,70 @@ fn what_moves_is_told_counts_as_unsplit_and_is_waited_for() {
 
 #[test]
 fn wrong_options_are_refused() {
+    let served = Served::start(2, Faults::default());
+    let tin = tin_options();
+    // The water has no triangles: all of a scene is streamed in one encoding, or not at all.
+    let error = Terrain::open(&served.url, tin.clone()).unwrap_err().to_string();
+    assert!(error.contains("'water' is offered as points, asked for as tin: build"), "{error}");
     let served = Served::start(1, Faults::default());
-    let tin = Options { encoding: "tin".into(), ..Options::default() };
-    let error = Terrain::open(&served.url, tin).unwrap_err().to_string();
-    assert!(error.contains("'tin'") && error.contains("points"), "{error}");
+    assert!(Terrain::open(&served.url, tin.clone()).is_ok());
+    let moving = Options { morph_seconds: 1.0, ..tin };
+    assert!(matches!(Terrain::open(&served.url, moving), Err(TerrainError::Still)));
     let zero = Options { tolerance_pixels: 0.0, ..Options::default() };
     assert!(matches!(Terrain::open(&served.url, zero), Err(TerrainError::Tolerance(_))));
+}
+
+fn tin_options() -> Options {
+    let fetch = fetch::Options { encoding: Encoding::Tin, ..fetch::Options::default() };
+    Options { fetch, ..Options::default() }
+}
+
+#[test]
+fn irregular_triangles_settle_at_the_asked_error_within_their_memory() {
+    let served = Served::start(1, Faults::default());
+    let mut terrain = open(&served, tin_options());
+    let view = terrain.settle(&above(), MINUTE);
+    assert!(view.complete && view.error_pixels <= 1.0, "{:?}", terrain.problem());
+    let stats = view.stats;
+    println!("{stats:?}");
+    assert!(stats.triangles > 0 && stats.points_real == 0 && stats.traffic.errors == 0);
+    assert!(view.items.iter().all(|item| item.surface.tin().is_some()), "one encoding in a cut");
+    // In a third of the memory, it shows the best that fits.
+    let memory_bytes = stats.resident_bytes / 3;
+    let mut terrain = open(&served, Options { memory_bytes, ..tin_options() });
+    let less = terrain.settle(&above(), MINUTE);
+    assert!(less.complete && less.stats.resident_bytes <= memory_bytes, "{:?}", less.stats);
+    assert!(less.error_pixels > view.error_pixels && less.error_pixels == less.error_pixels_goal);
+    // Streams hold points: asking for one changes nothing.
+    terrain.stream(&above());
+    assert!(!terrain.fetcher.is_streaming());
+}
+
+#[test]
+fn irregular_triangles_that_are_damaged_are_refused_and_fetched_again() {
+    for faults in
+        [Faults { damaged: 0.05, ..Faults::default() }, Faults { garbage: 0.2, ..Faults::default() }]
+    {
+        let served = Served::start(1, faults);
+        let mut terrain = open(&served, tin_options());
+        let view = terrain.settle(&above(), MINUTE);
+        assert!(view.complete && view.error_pixels <= 1.0, "{faults:?}: {:?}", terrain.problem());
+        assert!(view.stats.traffic.errors > 0, "{faults:?} did nothing");
+    }
+}
+
+/// A checksum does not help against a server that means it.
+#[test]
+fn hostile_triangles_are_refused() {
+    let served = Served::start(1, Faults { forged: 0.1, ..Faults::default() });
+    let mut terrain = open(&served, tin_options());
+    let view = terrain.settle(&above(), MINUTE);
+    assert!(view.complete, "{:?}", terrain.problem());
+    assert!(view.stats.traffic.errors > 0);
+    let served = Served::start(1, Faults { forged: 1.0, ..Faults::default() });
+    let mut terrain = open(&served, tin_options());
+    let view = terrain.settle(&above(), MINUTE);
+    assert!(!view.complete, "{:?}", view.stats);
+    assert!(view.items.is_empty(), "{:?}", view.stats);
+    assert!(terrain.problem().is_some(), "{:?}", view.stats);
 }

@@ -68,6 +68,7 @@ impl Build<'_> {
             bytes: point_bytes + index_bytes,
             resampled: self.grid.resampled,
             errors: "exact".to_owned(),
+            tin: None,
         };
         Ok((layer, Sums { diamonds, point_bytes, index_bytes }))
     }

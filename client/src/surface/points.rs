@@ -1,4 +1,4 @@
-//! The geometry of a split diamond: its block of heights with a slope at each point.
+//! A split diamond as a grid: its block of heights with a slope at each point.
 //!
 //! Slopes follow the same rule as heights: a split changes only what lies strictly inside, so two
 //! surfaces that meet along a side agree about its shading too, and light shows no seams.
@@ -16,27 +16,18 @@ use diamantina_protocol::diamond::{Block, Diamond, walk_shared};
 use diamantina_protocol::message::Layer;
 use diamantina_protocol::points::{self, DecodeError, Tally};
 
-/// The upward normal of a surface with a slope (metres up for a metre east, and for a metre north): its east and
-/// north, times 32767.
-#[must_use]
-pub fn normal([east, north]: [f32; 2]) -> [i16; 2] {
-    let length = (1.0 + east * east + north * north).sqrt();
-    // A float to integer cast saturates.
-    [east, north].map(|s| (-s / length * 32767.0).round() as i16)
-}
-
 /// The heights and slopes of a split diamond.
 ///
 /// Takes `12 ((n+1)^2 + n^2)` bytes: 100 kB for n = 64.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Surface {
+pub struct Points {
     block: Block,
     slopes: Vec<[f32; 2]>,
     has_nodata: bool,
     tally: Tally,
 }
 
-impl Surface {
+impl Points {
     /// Decodes what `d`'s split adds to what its parents have. `parents` are the surfaces of
     /// `forest.parents(d)`, in that order. The bytes may be hostile.
     ///

@@ -1,0 +1,371 @@
+//! The `tin` encoding: the triangles that are drawn once a diamond is split, as bytes.
+//!
+//! A patch holds the irregular networks of the (up to) four child triangles of a diamond's square. It needs no
+//! other patch to be decoded. Vertices lie on points of the lattice; those on the square's outer border are the
+//! same, height and all, in whatever patch lies across it, so there are no cracks. Where there are no
+//! triangles there are no data.
+//!
+//! A payload tells the mesh in the order of a walk over it that both ends take (`walk`): of each edge what lies
+//! beyond, and of each new vertex how far it is from where the triangle behind the edge lets it expect. So no
+//! index is ever sent, and most of what is sent is small.
+//!
+//! | offset | size | field | valid range |
+//! |---|---|---|---|
+//! | 0 | 1 | format, in the high four bits | 1 |
+//! | 0 | | bit 0: some border lies inside of the square; bit 1: two lanes, just where there are as many triangles as [`TWO_LANES_TRIANGLES`] | |
+//! | 1 | .. | symbols, see [`crate::rans`] | |
+//!
+//! The symbols are: base-2 logarithm of the unit of x and y (5 plain bits); the first vertex's height; one less than
+//! the unit of heights, which is the largest that divides all differences; the walk. Each bit of the walk has an
+//! adaptive context, and goes in the first lane; all numbers go in the last. A payload without bytes is a patch
+//! without triangles.
+//!
+//! Every payload that decodes encodes to the same bytes again: nothing can be said in two ways.
+
+mod mesh;
+mod numbers;
+mod regular;
+mod walk;
+
+use crate::HEIGHT_MAX;
+use crate::bintree::Forest;
+use crate::diamond::Diamond;
+use crate::rans::{Context, Decoder, Encoder};
+use mesh::Mesh;
+use numbers::Scale;
+use walk::{Beyond, Fault, Pass, Point, Square, Walk};
+
+/// The format that this build writes, and the only one that it reads.
+pub const FORMAT: u8 = 1;
+
+/// The most triangles of a patch: a full grid of the largest patches' cells.
+pub const TRIANGLES_MAX: usize = 1 << 16;
+
+/// The most vertices of a patch: indices of 16 bits, but for the one that restarts strips.
+pub const VERTICES_MAX: usize = (1 << 16) - 1;
+
+/// Payloads of this many triangles and more have two lanes: a second one costs three bytes.
+pub const TWO_LANES_TRIANGLES: usize = 512;
+
+const HOLES: u8 = 1;
+const TWO_LANES: u8 = 2;
+
+/// A vertex of a patch.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub struct Vertex {
+    /// Lattice coordinate, to the east.
+    pub x: u32,
+    /// Lattice coordinate, to the north.
+    pub y: u32,
+    /// Height, in quanta.
+    pub height: i32,
+}
+
+/// What is drawn once a diamond is split.
+///
+/// Takes 12 bytes a vertex and 12 a triangle: 1.6 MB at most.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Patch {
+    /// The vertices; those on the diagonals belong to more than one child triangle.
+    pub vertices: Vec<Vertex>,
+    /// Triangles as indices of vertices, turning left in plan: first those of child triangle 0, and so on.
+    pub triangles: Vec<[u32; 3]>,
+    /// For each child triangle, where its triangles end. Child triangle q has side q of the diamond's local grid
+    /// as its hypotenuse, and the diamond's centre as its apex.
+    pub ends: [u32; 4],
+}
+
+impl Patch {
+    /// The triangles of a child triangle, as positions in [`Patch::triangles`].
+    #[must_use]
+    pub fn range(&self, child: usize) -> std::ops::Range<usize> {
+        let from = if child == 0 { 0 } else { self.ends[child - 1] };
+        from as usize..self.ends[child] as usize
+    }
+}
+
+/// Why a patch cannot be encoded. Each is a mistake of whoever made it.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum PatchError {
+    /// Too many triangles.
+    #[error("patch of {0} triangles, limit {TRIANGLES_MAX}: simplify further, or take a smaller patch")]
+    Triangles(usize),
+    /// Too many vertices.
+    #[error("patch of more than {VERTICES_MAX} vertices: simplify further, or take a smaller patch")]
+    Vertices,
+    /// Ranges that are none.
+    #[error("patch's triangles end at {0:?}, expected rising numbers up to their count")]
+    Ends([u32; 4]),
+    /// A triangle of a vertex that is not there.
+    #[error("triangle {0:?} of a vertex that the patch has not")]
+    Vertex([u32; 3]),
+    /// A triangle that turns right, or has no area.
+    #[error("triangle {0:?} does not turn left")]
+    Turn([u32; 3]),
+    /// A triangle outside of its child triangle.
+    #[error("triangle {0:?} is not within child triangle {1}")]
+    Child([u32; 3], usize),
+    /// Two triangles on the same side of an edge, or overlapping ones.
+    #[error("triangles overlap at the edge from vertex {0} to {1}")]
+    Edge(u32, u32),
+    /// Triangles that overlap somewhere.
+    #[error("triangles overlap")]
+    Overlap,
+    /// A height beyond the range of heights.
+    #[error("height of {0} quanta, expected at most {HEIGHT_MAX}")]
+    Height(i32),
+}
+
+/// Why bytes are not the payload of a diamond. Whichever it is, drop them and ask again.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum DecodeError {
+    /// Written by another version.
+    #[error("patch has format {found}, this build reads {FORMAT}: rebuild the store")]
+    Format {
+        /// The format found.
+        found: u8,
+    },
+    /// Unknown flags.
+    #[error("patch has flags {found:#x}, expected at most 0x3: fetch it again")]
+    Flags {
+        /// The flags found.
+        found: u8,
+    },
+    /// Cut off, with something behind, or not written by an encoder.
+    #[error("patch's symbols are damaged: fetch it again")]
+    Symbols,
+    /// A vertex outside of the diamond, or a triangle that overlaps another.
+    #[error("patch has a vertex or a triangle out of its place: fetch it again")]
+    Place,
+    /// More triangles or vertices than a patch may have.
+    #[error("patch of more than {TRIANGLES_MAX} triangles or {VERTICES_MAX} vertices: fetch it again")]
+    Size,
+    /// A height beyond the range of heights.
+    #[error("patch has a height beyond {HEIGHT_MAX} quanta: fetch it again")]
+    Height,
+}
+
+impl From<Fault> for DecodeError {
+    fn from(fault: Fault) -> Self {
+        match fault {
+            Fault::Symbols => Self::Symbols,
+            Fault::Place => Self::Place,
+            Fault::Size => Self::Size,
+        }
+    }
+}
+
+/// What comes before the walk.
+#[derive(Debug, Clone, Copy)]
+struct Units {
+    /// Base-2 logarithm of the unit of x and y.
+    shift: u32,
+    /// The first vertex's height, in quanta.
+    base: i64,
+    /// The unit of heights, in quanta.
+    step: i64,
+}
+
+impl Units {
+    /// Sends or receives them.
+    fn pass(self, pass: &mut impl Pass) -> Result<Self, Fault> {
+        let shift = pass.plain(self.shift, 5);
+        let base = pass.number(&mut Scale::expecting(1024), self.base)?;
+        let step = 1 + pass.number(&mut Scale::expecting(1), self.step - 1)?;
+        Ok(Self { shift, base, step })
+    }
+}
+
+/// The bytes of a patch. They depend on the patch alone: on the order of its triangles, but not on that of its vertices.
+///
+/// What comes back has the same triangles in another order, each child triangle's together, in an order that caches
+/// like; vertices in the order in which triangles use them, without those that none does; and one vertex for
+/// each fan of triangles where fans meet in a point alone.
+///
+/// # Errors
+/// When it is no patch of this diamond.
+pub fn encode(forest: &Forest, d: Diamond, patch: &Patch) -> Result<Vec<u8>, PatchError> {
+    let Some(first) = patch.triangles.first().and_then(|t| patch.vertices.get(t[0] as usize)) else {
+        return if patch.triangles.is_empty() {
+            Ok(Vec::new())
+        } else {
+            Err(PatchError::Vertex(patch.triangles[0]))
+        };
+    };
+    let used = || patch.triangles.iter().flatten().filter_map(|v| patch.vertices.get(*v as usize));
+    if let Some(bad) = used().find(|v| v.height.unsigned_abs() > HEIGHT_MAX.unsigned_abs()) {
+        return Err(PatchError::Height(bad.height));
+    }
+    let centre = d.centre();
+    let all = used().fold(0, |all, v| all | (v.x ^ centre[0]) | (v.y ^ centre[1]));
+    let base = i64::from(first.height);
+    let step = used().fold(0, |step, v| gcd(step, i64::from(v.height) - base)).max(1);
+    let units = Units { shift: all.trailing_zeros().min(31), base, step };
+    let points: Vec<Point> = patch
+        .vertices
+        .iter()
+        .map(|v| Point {
+            x: (i64::from(v.x) - i64::from(centre[0])) >> units.shift,
+            y: (i64::from(v.y) - i64::from(centre[1])) >> units.shift,
+            height: (i64::from(v.height) - base) / step,
+        })
+        .collect();
+    let square = Square::new(forest, d, units.shift);
+    let mesh = Mesh::new(patch, &points, &square)?;
+    let holes = mesh.has_holes(&square);
+    let mut sender = Sender { coder: Encoder::default(), mesh };
+    let passed = units.pass(&mut sender).and_then(|_| Walk::new(square, holes).run(&mut sender));
+    passed.map_err(|fault| if fault == Fault::Size { PatchError::Vertices } else { PatchError::Overlap })?;
+    let two_lanes = patch.triangles.len() >= TWO_LANES_TRIANGLES;
+    let flags = if holes { HOLES } else { 0 } | if two_lanes { TWO_LANES } else { 0 };
+    let mut bytes = sender.coder.finish(if two_lanes { 2 } else { 1 });
+    bytes.insert(0, FORMAT << 4 | flags);
+    Ok(bytes)
+}
+
+/// The patch of a diamond. The bytes may be hostile: whatever is returned has no more than [`TRIANGLES_MAX`]
+/// triangles, each turning left within its child triangle, no two on the same side of an edge, and heights in range.
+///
+/// Takes 8 MB beside the patch at most, and time in proportion to the triangles.
+///
+/// # Errors
+/// When the bytes are no payload of this format.
+pub fn decode(forest: &Forest, d: Diamond, bytes: &[u8]) -> Result<Patch, DecodeError> {
+    let Some((header, symbols)) = bytes.split_first() else { return Ok(Patch::default()) };
+    let (format, flags) = (header >> 4, header & 15);
+    if format != FORMAT {
+        return Err(DecodeError::Format { found: format });
+    }
+    if flags > HOLES | TWO_LANES {
+        return Err(DecodeError::Flags { found: flags });
+    }
+    let lanes = if flags & TWO_LANES == 0 { 1 } else { 2 };
+    let coder = Decoder::new(symbols, lanes).ok_or(DecodeError::Symbols)?;
+    let mut receiver = Receiver { coder, lane: lanes - 1 };
+    let units = Units { shift: 0, base: 0, step: 1 }.pass(&mut receiver)?;
+    let square = Square::new(forest, d, units.shift);
+    if square.is_empty() || units.step < 1 {
+        return Err(DecodeError::Symbols);
+    }
+    let mut walk = Walk::new(square, flags & HOLES != 0);
+    walk.run(&mut receiver)?;
+    let enough = walk.triangles().len() >= TWO_LANES_TRIANGLES;
+    if !receiver.coder.is_spent() || enough != (lanes == 2) {
+        return Err(DecodeError::Symbols);
+    }
+    gather(&walk, units, d)
+}
+
+/// The patch that a walk has found, if its units are as large as can be.
+fn gather(walk: &Walk, units: Units, d: Diamond) -> Result<Patch, DecodeError> {
+    let centre = d.centre().map(i64::from);
+    let mut vertices = Vec::with_capacity(walk.points().len());
+    let (mut odd, mut divisor) = (0, 0);
+    for (i, point) in walk.points().enumerate() {
+        odd |= point.x | point.y;
+        if divisor != 1 {
+            divisor = gcd(divisor, point.height);
+        }
+        let height = units.base + units.step * point.height;
+        if (i == 0 && point.height != 0) || height.abs() > i64::from(HEIGHT_MAX) {
+            return Err(DecodeError::Height);
+        }
+        let place = |middle: i64, away: i64| {
+            u32::try_from(middle + (away << units.shift)).map_err(|_| DecodeError::Place)
+        };
+        vertices.push(Vertex {
+            x: place(centre[0], point.x)?,
+            y: place(centre[1], point.y)?,
+            height: i32::try_from(height).map_err(|_| DecodeError::Height)?,
+        });
+    }
+    if odd & 1 == 0 || (divisor != 1 && (divisor != 0 || units.step != 1)) {
+        return Err(DecodeError::Symbols);
+    }
+    let mut counts = [0u32; 4];
+    for (_, child) in walk.triangles() {
+        counts[usize::from(child)] += 1;
+    }
+    let mut ends = counts;
+    for child in 1..4 {
+        ends[child] += ends[child - 1];
+    }
+    let mut at: [u32; 4] = std::array::from_fn(|child| ends[child] - counts[child]);
+    let mut triangles = vec![[0; 3]; walk.triangles().len()];
+    for (triangle, child) in walk.triangles() {
+        let slot = &mut at[usize::from(child)];
+        triangles[*slot as usize] = triangle;
+        *slot += 1;
+    }
+    Ok(Patch { vertices, triangles, ends })
+}
+
+fn gcd(a: i64, b: i64) -> i64 {
+    let (mut a, mut b) = (a.abs(), b.abs());
+    while b != 0 {
+        (a, b) = (b, a % b);
+    }
+    a
+}
+
+struct Sender {
+    coder: Encoder,
+    mesh: Mesh,
+}
+
+struct Receiver<'a> {
+    coder: Decoder<'a>,
+    /// That of numbers; bits go in the first.
+    lane: usize,
+}
+
+impl Pass for Sender {
+    fn bit(&mut self, context: &mut Context, bit: bool) -> bool {
+        self.coder.bit(context, bit);
+        bit
+    }
+    fn number(&mut self, scale: &mut Scale, number: i64) -> Result<i64, Fault> {
+        numbers::encode(&mut self.coder, 1, scale, number);
+        Ok(number)
+    }
+    fn plain(&mut self, value: u32, bits: u32) -> u32 {
+        numbers::plain(&mut self.coder, 1, value, bits);
+        value
+    }
+    fn seed(&mut self) -> Option<[Point; 2]> {
+        self.mesh.seed()
+    }
+    fn beyond(&mut self, a: u32, b: u32) -> Beyond {
+        self.mesh.beyond(a, b)
+    }
+}
+
+impl Pass for Receiver<'_> {
+    #[inline]
+    fn bit(&mut self, context: &mut Context, _: bool) -> bool {
+        self.coder.bit(context)
+    }
+    #[inline]
+    fn number(&mut self, scale: &mut Scale, _: i64) -> Result<i64, Fault> {
+        numbers::decode(&mut self.coder, self.lane, scale).ok_or(Fault::Symbols)
+    }
+    fn plain(&mut self, _: u32, bits: u32) -> u32 {
+        numbers::read_plain(&mut self.coder, self.lane, bits)
+    }
+    fn seed(&mut self) -> Option<[Point; 2]> {
+        None
+    }
+    #[inline]
+    fn beyond(&mut self, _: u32, _: u32) -> Beyond {
+        Beyond::Nothing
+    }
+}
+
+#[cfg(test)]
+#[allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_sign_loss,
+    reason = "small numbers"
+)]
+mod tests;

@@ -1,0 +1,246 @@
+//! Random meshes there and back, and bytes that are none.
+
+use super::*;
+use crate::NODATA;
+use proptest::prelude::*;
+use std::collections::BTreeSet;
+
+/// Numbers that look random, the same each time.
+struct Dice(u64);
+
+impl Dice {
+    fn below(&mut self, limit: usize) -> usize {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 33) as usize % limit.max(1)
+    }
+}
+
+fn any_forest() -> impl Strategy<Value = Forest> {
+    (2u8..=4, 1u8..=3, 1u32..=3, 1u32..=2)
+        .prop_map(|(patch, extra, columns, rows)| Forest::new(patch + extra, patch, [columns, rows]).unwrap())
+}
+
+fn pick(forest: &Forest, dice: &mut Dice) -> Diamond {
+    let level = dice.below(forest.levels() as usize) as u32;
+    let all: Vec<_> = forest.diamonds(level).collect();
+    all[dice.below(all.len())]
+}
+
+/// A mesh of a diamond: regular, with edges collapsed at random and triangles torn out.
+fn random_patch(forest: &Forest, d: Diamond, dice: &mut Dice) -> Patch {
+    let (holes, relief, step) = (dice.below(4), 1 + dice.below(5000), 1 + dice.below(3) as i32 * 7);
+    let mut roll = Dice(dice.0);
+    let mut patch = Patch::regular(forest, d, forest.segments(), |_| {
+        (holes == 0 || roll.below(12) > 0).then(|| (roll.below(relief) as i32 - 2000) * step)
+    });
+    for _ in 0..dice.below(2 * patch.triangles.len() + 1) {
+        collapse(forest, d, &mut patch, dice);
+    }
+    if holes > 1 {
+        let keep: Vec<bool> = patch.triangles.iter().map(|_| dice.below(10) > holes).collect();
+        patch = with_triangles(&patch, |i| keep[i].then(|| patch.triangles[i]));
+    }
+    patch
+}
+
+/// The patch with each triangle as `of` says, or without it.
+fn with_triangles(patch: &Patch, of: impl Fn(usize) -> Option<[u32; 3]>) -> Patch {
+    let mut new = Patch { vertices: patch.vertices.clone(), ..Patch::default() };
+    for child in 0..4 {
+        new.triangles.extend(patch.range(child).filter_map(&of));
+        new.ends[child] = new.triangles.len() as u32;
+    }
+    new
+}
+
+/// Moves a random corner's vertex to the next corner's, if no triangle turns or leaves its child triangle by it.
+fn collapse(forest: &Forest, d: Diamond, patch: &mut Patch, dice: &mut Dice) {
+    let Some(triangle) = patch.triangles.get(dice.below(patch.triangles.len())) else { return };
+    let (from, to) = (triangle[0], triangle[1]);
+    let square = Square::new(forest, d, 0);
+    let centre = d.centre().map(i64::from);
+    let place = |v: u32| {
+        let vertex = patch.vertices[v as usize];
+        [i64::from(vertex.x) - centre[0], i64::from(vertex.y) - centre[1]]
+    };
+    let moved = with_triangles(patch, |i| {
+        let triangle = patch.triangles[i].map(|v| if v == from { to } else { v });
+        (triangle.iter().filter(|v| **v == to).count() < 2).then_some(triangle)
+    });
+    let mut edges = BTreeSet::new();
+    for child in 0..4 {
+        for triangle in &moved.triangles[moved.range(child)] {
+            let [a, b, c] = triangle.map(place);
+            let turns = (b[0] - a[0]) * (c[1] - a[1]) > (b[1] - a[1]) * (c[0] - a[0]);
+            let inside = [a, b, c].iter().all(|p| square.within(p[0], p[1]).children & 1 << child != 0);
+            let fresh = (0..3).all(|i| edges.insert((triangle[i], triangle[(i + 1) % 3])));
+            if !turns || !inside || !fresh {
+                return;
+            }
+        }
+    }
+    // The areas say whether something was covered twice, or laid bare.
+    if area(&moved) == area(patch) {
+        *patch = moved;
+    }
+}
+
+fn area(patch: &Patch) -> i64 {
+    let area = |t: &[u32; 3]| {
+        let [a, b, c] =
+            t.map(|v| [patch.vertices[v as usize].x, patch.vertices[v as usize].y].map(i64::from));
+        (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+    };
+    patch.triangles.iter().map(area).sum()
+}
+
+/// The triangles as sets of places, by child.
+fn shapes(patch: &Patch) -> Vec<(usize, [Vertex; 3])> {
+    let mut list = Vec::new();
+    for child in 0..4 {
+        for triangle in &patch.triangles[patch.range(child)] {
+            let mut corners = triangle.map(|v| patch.vertices[v as usize]);
+            let first = (0..3).min_by_key(|i| (corners[*i].y, corners[*i].x)).unwrap();
+            corners.rotate_left(first);
+            list.push((child, corners));
+        }
+    }
+    list.sort_unstable_by_key(|(child, t)| (*child, t.map(|v| (v.y, v.x, v.height))));
+    list
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(400))]
+
+    #[test]
+    fn meshes_come_back_and_encode_to_the_same_bytes(forest in any_forest(), seed in any::<u64>()) {
+        let mut dice = Dice(seed);
+        let d = pick(&forest, &mut dice);
+        let patch = random_patch(&forest, d, &mut dice);
+        let bytes = encode(&forest, d, &patch).unwrap();
+        let back = decode(&forest, d, &bytes).unwrap();
+        prop_assert_eq!(shapes(&back), shapes(&patch));
+        prop_assert_eq!(encode(&forest, d, &back), Ok(bytes));
+        // Vertices come in the order in which triangles use them, but for child triangles, none in vain.
+        let used: BTreeSet<u32> = back.triangles.iter().flatten().copied().collect();
+        prop_assert_eq!(used.len(), back.vertices.len());
+    }
+
+    #[test]
+    fn bytes_with_a_change_are_refused_or_are_another_patch(forest in any_forest(), seed in any::<u64>(), flips in prop::collection::vec((any::<u16>(), 0u8..8), 1..4)) {
+        let mut dice = Dice(seed);
+        let d = pick(&forest, &mut dice);
+        let mut bytes = encode(&forest, d, &random_patch(&forest, d, &mut dice)).unwrap();
+        for (at, bit) in flips {
+            let at = usize::from(at) % bytes.len().max(1);
+            if let Some(byte) = bytes.get_mut(at) { *byte ^= 1 << bit; }
+        }
+        if let Ok(patch) = decode(&forest, d, &bytes) {
+            prop_assert_eq!(encode(&forest, d, &patch), Ok(bytes));
+        }
+    }
+
+    #[test]
+    fn any_bytes_are_a_patch_or_an_error(forest in any_forest(), seed in any::<u64>(), flags in 0u8..4, mut bytes in prop::collection::vec(any::<u8>(), 0..600)) {
+        let d = pick(&forest, &mut Dice(seed));
+        bytes.insert(0, FORMAT << 4 | flags);
+        if let Ok(patch) = decode(&forest, d, &bytes) {
+            prop_assert_eq!(encode(&forest, d, &patch), Ok(bytes));
+        }
+    }
+}
+
+/// A patch of some relief, for tests that change its bytes.
+fn sample() -> (Forest, Diamond, Patch) {
+    let forest = Forest::new(6, 3, [2, 1]).unwrap();
+    let d = forest.diamonds(3).nth(5).unwrap();
+    let patch = Patch::regular(&forest, d, 8, |[x, y]| Some((x * x / 7 + 3 * y) as i32 % 911));
+    (forest, d, patch)
+}
+
+#[test]
+fn golden_bytes_of_format_1() {
+    let forest = Forest::new(3, 2, [1, 1]).unwrap();
+    let d = forest.root_diamonds().next().unwrap();
+    let patch = Patch::regular(&forest, d, 1, |[x, y]| Some((10 * x + y) as i32));
+    let bytes = encode(&forest, d, &patch).unwrap();
+    assert_eq!(bytes, GOLDEN);
+    assert_eq!(decode(&forest, d, &bytes).unwrap().vertices.len(), 5);
+}
+
+const GOLDEN: [u8; 13] = [16, 194, 10, 71, 0, 0, 142, 184, 210, 159, 53, 204, 44];
+
+#[test]
+fn no_triangles_are_no_bytes() {
+    let (forest, d, _) = sample();
+    assert_eq!(encode(&forest, d, &Patch::default()), Ok(Vec::new()));
+    assert_eq!(decode(&forest, d, &[]), Ok(Patch::default()));
+    let lone = Patch { vertices: vec![Vertex::default()], ..Patch::default() };
+    assert_eq!(encode(&forest, d, &lone), Ok(Vec::new()));
+}
+
+#[test]
+fn damaged_payloads_are_refused() {
+    let (forest, d, patch) = sample();
+    let good = encode(&forest, d, &patch).unwrap();
+    for cut in 1..good.len() {
+        assert!(decode(&forest, d, &good[..cut]).is_err(), "prefix of {cut} bytes");
+    }
+    let mut long = good.clone();
+    long.push(0);
+    assert!(decode(&forest, d, &long).is_err(), "a byte too many");
+    let with = |header: u8| {
+        let mut bytes = good.clone();
+        bytes[0] = header;
+        decode(&forest, d, &bytes)
+    };
+    assert_eq!(with(9 << 4), Err(DecodeError::Format { found: 9 }));
+    assert_eq!(with(FORMAT << 4 | 12), Err(DecodeError::Flags { found: 12 }));
+    assert!(with(FORMAT << 4 | HOLES).is_err() && with(FORMAT << 4 | TWO_LANES).is_err());
+}
+
+#[test]
+fn patches_that_are_none_are_refused() {
+    let (forest, d, good) = sample();
+    let with = |change: &dyn Fn(&mut Patch)| {
+        let mut patch = good.clone();
+        change(&mut patch);
+        encode(&forest, d, &patch).unwrap_err()
+    };
+    assert!(matches!(with(&|p| p.triangles[3].swap(0, 1)), PatchError::Turn(_)));
+    assert!(matches!(with(&|p| p.triangles[3][0] = 9999), PatchError::Vertex(_)));
+    assert!(matches!(with(&|p| p.ends[3] -= 1), PatchError::Ends(_)));
+    assert!(matches!(with(&|p| p.ends[0] -= 1), PatchError::Child(_, 1)));
+    assert!(matches!(with(&|p| p.triangles[1] = p.triangles[0]), PatchError::Edge(..)));
+    assert!(matches!(with(&|p| p.vertices[0].height = HEIGHT_MAX + 1), PatchError::Height(_)));
+    assert!(matches!(with(&|p| p.vertices[0].height = NODATA), PatchError::Height(_)));
+    assert!(matches!(with(&|p| p.vertices[0].x += 64), PatchError::Child(..) | PatchError::Turn(_)));
+}
+
+#[test]
+fn the_largest_patch_fits_and_a_larger_one_does_not() {
+    let forest = Forest::new(8, 7, [1, 1]).unwrap();
+    let d = forest.root_diamonds().next().unwrap();
+    let mut dice = Dice(3);
+    let patch = Patch::regular(&forest, d, 128, |_| Some(dice.below(60_000) as i32 - 30_000));
+    assert_eq!(patch.triangles.len(), TRIANGLES_MAX);
+    let bytes = encode(&forest, d, &patch).unwrap();
+    assert_eq!(shapes(&decode(&forest, d, &bytes).unwrap()), shapes(&patch));
+    assert!(bytes.len() < crate::message::PAYLOAD_BYTES_MAX as usize, "{} bytes", bytes.len());
+    let mut more = patch.clone();
+    more.triangles.push(patch.triangles[0]);
+    more.ends[3] += 1;
+    assert_eq!(encode(&forest, d, &more), Err(PatchError::Triangles(TRIANGLES_MAX + 1)));
+}
+
+/// As many parts as triangles: more vertices than indices of 16 bits name.
+#[test]
+fn too_many_vertices_are_refused() {
+    let forest = Forest::new(8, 7, [1, 1]).unwrap();
+    let d = forest.root_diamonds().next().unwrap();
+    let whole = Patch::regular(&forest, d, 128, |_| Some(0));
+    // Of each cell the triangles to the south and to the north, which meet in points alone.
+    let some = with_triangles(&whole, |i| (i % 2 == 0).then(|| whole.triangles[i]));
+    assert!(some.triangles.len() * 3 > VERTICES_MAX);
+    assert_eq!(encode(&forest, d, &some), Err(PatchError::Vertices));
+}
