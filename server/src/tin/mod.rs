@@ -1,0 +1,72 @@
+//! Triangulated irregular networks of diamonds, made from finer ones by *mark, merge, simplify*.
+//!
+//! A diamond's square is covered by the four triangles of its split, each with its own [`Tin`]. They are *merged* into
+//! one mesh; the square's outer border is *marked*, so that it stays; the mesh is *simplified*, and cut along the
+//! hypotenuse into the two triangles that the diamond is drawn as when it is not split. Each of these is one of the four
+//! of one of its parents, and so on up to the roots. Vertices on a hypotenuse are the same in both halves, since they
+//! were simplified as one; on the other sides nothing was changed: so no cut that follows the diamonds has a
+//! crack. After Cignoni et al., *BDAM* (2003).
+//!
+//! Collapses never make a vertex: each is a sample of the source, with whole numbers for x, y and height.
+//!
+//! Where the source has no data there are no triangles. Its finest triangulation is that of its lattice, each cell cut
+//! along the diagonal of the bintree, without the triangles that have a corner without data: their edges are the
+//! source's border. A sample that belongs to no triangle (one alone, or in a thread of diagonal steps) is
+//! drawn at no level, and errors do not count it.
+
+mod collapse;
+mod ground;
+mod mesh;
+mod metric;
+mod patch;
+mod queue;
+
+pub use collapse::Until;
+pub use ground::Ground;
+pub use patch::{Border, Merged, Simplified, Tin, half_of, merge, simplify, source};
+
+use serde::{Deserialize, Serialize};
+
+/// A vertex in lattice coordinates; the height in quanta.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
+pub struct Vertex {
+    /// To the east.
+    pub x: u32,
+    /// To the north.
+    pub y: u32,
+    /// In quanta.
+    pub height: i32,
+}
+
+/// The order of collapses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Metric {
+    /// By how much normals change.
+    Normal,
+    /// By squared distances to planes.
+    Quadric,
+}
+
+/// Metres of the lattice's units.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Scale {
+    /// Of a step along x and y.
+    pub cell: [f64; 2],
+    /// Of a quantum of height.
+    pub quantum: f64,
+}
+
+/// How meshes are simplified.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rules {
+    /// The order of collapses.
+    pub metric: Metric,
+    /// How much borders along nodata count in it.
+    pub lambda: f64,
+    /// Metres of the lattice's units.
+    pub scale: Scale,
+}
+
+#[cfg(test)]
+mod tests;
