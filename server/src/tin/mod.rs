@@ -25,18 +25,8 @@ pub use collapse::Until;
 pub use ground::Ground;
 pub use patch::{Border, Merged, Simplified, Tin, half_of, merge, simplify, source};
 
+use diamantina_protocol::tin::Vertex;
 use serde::{Deserialize, Serialize};
-
-/// A vertex in lattice coordinates; the height in quanta.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
-pub struct Vertex {
-    /// To the east.
-    pub x: u32,
-    /// To the north.
-    pub y: u32,
-    /// In quanta.
-    pub height: i32,
-}
 
 /// The order of collapses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

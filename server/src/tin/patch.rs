@@ -8,6 +8,7 @@ use super::{Rules, Vertex};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
+use diamantina_protocol::tin::Patch;
 use std::collections::HashMap;
 
 /// An edge of the border, from vertex to vertex, and the points of the source's border that it stands for, but for those
@@ -29,11 +30,7 @@ pub struct Tin {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Merged {
     /// What lies on a side of two triangles is one vertex.
-    pub vertices: Vec<Vertex>,
-    /// Triangle by triangle of the bintree.
-    pub triangles: Vec<[u32; 3]>,
-    /// Where the triangles of each of the four end.
-    pub ends: [u32; 4],
+    pub patch: Patch,
     /// See [`Tin::borders`].
     pub borders: Vec<Border>,
 }
@@ -98,12 +95,12 @@ pub fn source(forest: &Forest, d: Diamond, ground: Ground<'_>) -> Merged {
                 if heights.contains(&NODATA) || !(even || inside(corners)) {
                     continue;
                 }
-                merged.triangles.push(std::array::from_fn(|i| {
+                merged.patch.triangles.push(std::array::from_fn(|i| {
                     let [x, y] = corners[i];
                     let slot = &mut numbers[(y - low[1]) as usize * columns + (x - low[0]) as usize];
                     if *slot == NONE {
-                        *slot = u32::try_from(merged.vertices.len()).unwrap_or(NONE);
-                        merged.vertices.push(Vertex { x, y, height: heights[i] });
+                        *slot = u32::try_from(merged.patch.vertices.len()).unwrap_or(NONE);
+                        merged.patch.vertices.push(Vertex { x, y, height: heights[i] });
                     }
                     *slot
                 }));
@@ -120,27 +117,27 @@ pub fn merge(forest: &Forest, d: Diamond, tins: [&Tin; 4]) -> Merged {
     let [x, y] = d.centre();
     let centre = Vertex { x, y, height: 0 };
     let mut merged = Merged::default();
-    merged.vertices.reserve(tins.iter().map(|t| t.vertices.len()).sum());
-    merged.triangles.reserve(tins.iter().map(|t| t.triangles.len()).sum());
+    merged.patch.vertices.reserve(tins.iter().map(|t| t.vertices.len()).sum());
+    merged.patch.triangles.reserve(tins.iter().map(|t| t.triangles.len()).sum());
     let mut shared: HashMap<[u32; 2], u32> = HashMap::new();
     for (i, tin) in tins.into_iter().enumerate() {
         let numbers: Vec<u32> = tin
             .vertices
             .iter()
             .map(|v| {
-                let next = u32::try_from(merged.vertices.len()).unwrap_or(NONE);
+                let next = u32::try_from(merged.patch.vertices.len()).unwrap_or(NONE);
                 // Two lines through the centre part the four.
                 let is_shared = turn(square.a, centre, *v) == 0 || turn(square.lower, centre, *v) == 0;
                 let number = if is_shared { *shared.entry([v.x, v.y]).or_insert(next) } else { next };
                 if number == next {
-                    merged.vertices.push(*v);
+                    merged.patch.vertices.push(*v);
                 }
                 number
             })
             .collect();
         let renumber = |v: &u32| numbers[*v as usize];
-        merged.triangles.extend(tin.triangles.iter().map(|t| t.each_ref().map(renumber)));
-        merged.ends[i] = u32::try_from(merged.triangles.len()).unwrap_or(NONE);
+        merged.patch.triangles.extend(tin.triangles.iter().map(|t| t.each_ref().map(renumber)));
+        merged.patch.ends[i] = u32::try_from(merged.patch.triangles.len()).unwrap_or(NONE);
         merged
             .borders
             .extend(tin.borders.iter().map(|(edge, points)| (edge.each_ref().map(renumber), points.clone())));
@@ -151,11 +148,11 @@ pub fn merge(forest: &Forest, d: Diamond, tins: [&Tin; 4]) -> Merged {
 /// Simplifies the mesh of a diamond and cuts it along the hypotenuse.
 #[must_use]
 pub fn simplify(forest: &Forest, d: Diamond, merged: &Merged, rules: &Rules, until: Until<'_>) -> Simplified {
-    if merged.triangles.is_empty() {
+    if merged.patch.triangles.is_empty() {
         return Simplified::default();
     }
     let square = square(forest, d);
-    let mesh = Mesh::new(&merged.vertices, &merged.triangles);
+    let mesh = Mesh::new(&merged.patch.vertices, &merged.patch.triangles);
     let passed = find_passed(&mesh, merged);
     let mut simplifier = Simplifier::new(mesh, passed, square, rules, until);
     simplifier.run();
@@ -177,7 +174,9 @@ fn find_passed(mesh: &Mesh, merged: &Merged) -> Passed {
     }
     // By place: where triangles touch in a point alone, the mesh has other numbers.
     let place = |v: u32| [mesh.points[v as usize].x, mesh.points[v as usize].y];
-    let ends = |edge: [u32; 2]| edge.map(|v| [merged.vertices[v as usize].x, merged.vertices[v as usize].y]);
+    let ends = |edge: [u32; 2]| {
+        edge.map(|v| [merged.patch.vertices[v as usize].x, merged.patch.vertices[v as usize].y])
+    };
     let mut by_ends: HashMap<[[u32; 2]; 2], &Vec<[u32; 2]>> =
         merged.borders.iter().map(|(edge, points)| (ends(*edge), points)).collect();
     for h in mesh.borders() {

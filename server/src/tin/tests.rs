@@ -11,6 +11,7 @@ use super::*;
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
+use diamantina_protocol::tin::{self, Patch};
 use proptest::prelude::*;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
@@ -84,6 +85,7 @@ fn build(field: &Field, rules: &Rules, until: impl Fn(u32) -> Until<'static>) ->
                 );
             }
             if level < finest {
+                encode(&forest, d, &merged.patch);
                 built.split.insert(d, merged);
             }
             built.whole.insert(d, Whole { simplified, vertical });
@@ -94,9 +96,29 @@ fn build(field: &Field, rules: &Rules, until: impl Fn(u32) -> Until<'static>) ->
         let empty = Tin::default();
         let tins = children
             .map(|c| c.map_or(&empty, |c| &built.whole[&c].simplified.halves[half_of(&forest, c, d)]));
-        built.split.insert(d, merge(&forest, d, tins));
+        let merged = merge(&forest, d, tins);
+        encode(&forest, d, &merged.patch);
+        built.split.insert(d, merged);
     }
     built
+}
+
+/// A patch goes through bytes and comes back with as many triangles, if in another order.
+fn encode(forest: &Forest, d: Diamond, patch: &Patch) {
+    let bytes = tin::encode(forest, d, patch).unwrap();
+    let back = tin::decode(forest, d, &bytes).unwrap();
+    let corners = |patch: &Patch| {
+        let corner = |v: u32| patch.vertices[v as usize];
+        let rotated = |t: &[u32; 3]| {
+            let c = t.map(corner).map(|v| (v.x, v.y, v.height));
+            [[c[0], c[1], c[2]], [c[1], c[2], c[0]], [c[2], c[0], c[1]]].into_iter().min()
+        };
+        let mut all: Vec<_> = patch.triangles.iter().map(rotated).collect();
+        all.sort_unstable();
+        all
+    };
+    assert_eq!(back.ends, patch.ends);
+    assert_eq!(corners(&back), corners(patch));
 }
 
 /// A triangle as it is drawn, and the macro-triangle's distances.
@@ -123,8 +145,8 @@ impl Built {
         for d in &split {
             let merged = &self.split[d];
             let mut from = 0;
-            for (child, end) in deep.children(*d).into_iter().zip(merged.ends) {
-                let triangles = &merged.triangles[from as usize..end as usize];
+            for (child, end) in deep.children(*d).into_iter().zip(merged.patch.ends) {
+                let triangles = &merged.patch.triangles[from as usize..end as usize];
                 from = end;
                 let Some(child) = child else {
                     assert!(triangles.is_empty());
@@ -135,7 +157,7 @@ impl Built {
                 }
                 let whole = &self.whole[&child];
                 let (vertical, apart) = (whole.vertical, whole.simplified.apart);
-                let corners = triangles.iter().map(|t| t.map(|v| merged.vertices[v as usize]));
+                let corners = triangles.iter().map(|t| t.map(|v| merged.patch.vertices[v as usize]));
                 drawn.extend(corners.map(|corners| Drawn { corners, vertical, apart }));
             }
         }
@@ -236,7 +258,7 @@ fn assert_near(field: &Field, scale: &Scale, drawn: &[Drawn]) {
     let deep = forest.with_precision(1).unwrap();
     let apart = drawn.iter().map(|t| t.apart).fold(0.0, f64::max);
     for d in deep.diamonds(forest.levels()) {
-        for v in source(&deep, d, field.ground()).vertices {
+        for v in source(&deep, d, field.ground()).patch.vertices {
             if covered.contains(&(v.x, v.y)) {
                 continue;
             }
