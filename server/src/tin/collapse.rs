@@ -23,7 +23,7 @@ use std::collections::HashMap;
 /// Where simplification stops.
 #[derive(Debug, Clone, Copy)]
 pub enum Until<'a> {
-    /// At so many triangles, or a few less; but it goes on as long as nothing is lost.
+    /// At so many triangles of each half, or a few less; but it goes on as long as nothing is lost.
     Triangles(usize),
     /// Where any further collapse would put a sample farther away than so many quanta, or a border than so
     /// many metres.
@@ -116,8 +116,19 @@ impl<'a> Simplifier<'a> {
         Self { mesh, passed, square, rules, until, costs, roles, queue, star, other, ways }
     }
 
-    /// Collapses until there is nothing left to do.
+    /// Collapses until there is nothing left to do; on beyond an error as long as there are more triangles than a
+    /// payload has room for.
     pub(super) fn run(&mut self) {
+        self.pass();
+        if matches!(self.until, Until::Error { .. })
+            && self.mesh.live > self.halves() * self.rules.triangles_max
+        {
+            self.until = Until::Triangles(self.rules.triangles_max);
+            self.pass();
+        }
+    }
+
+    fn pass(&mut self) {
         for v in 0..u32::try_from(self.mesh.points.len()).unwrap_or(NONE) {
             if self.mesh.is_live(v) {
                 self.enqueue(v);
@@ -137,11 +148,16 @@ impl<'a> Simplifier<'a> {
         }
     }
 
+    /// How many triangles of the bintree the square has.
+    fn halves(&self) -> usize {
+        1 + usize::from(self.square.upper.is_some())
+    }
+
     /// Whether the star's centre has to stay since there are few enough triangles.
     fn is_enough(&self) -> bool {
         match self.until {
             Until::Triangles(target) => {
-                self.mesh.live <= target && !self.costs.importance(&self.mesh, &self.star).1
+                self.mesh.live <= self.halves() * target && !self.costs.importance(&self.mesh, &self.star).1
             }
             Until::Error { .. } => false,
         }

@@ -56,6 +56,8 @@ pub struct Rules {
     pub lambda: f64,
     /// Metres of the lattice's units.
     pub scale: Scale,
+    /// Triangles of each half of a diamond that are not exceeded for the sake of an error.
+    pub triangles_max: usize,
 }
 
 #[cfg(test)]

@@ -332,7 +332,7 @@ pub(super) fn fields() -> Vec<(&'static str, Field)> {
 const SCALE: Scale = Scale { cell: [30.0, 20.0], quantum: 0.5 };
 
 fn rules(metric: Metric, lambda: f64) -> Rules {
-    Rules { metric, lambda, scale: SCALE }
+    Rules { metric, lambda, scale: SCALE, triangles_max: usize::MAX }
 }
 
 /// A ground for limits that are given one by the builder.
@@ -407,7 +407,7 @@ fn what_is_free_to_go_goes_down_to_the_count() {
         if matches!(name, "hills" | "rough" | "step" | "spike") {
             let finest = field.forest.levels();
             let until = |level: u32| {
-                if level == finest { Until::Triangles(usize::MAX) } else { Until::Triangles(40) }
+                if level == finest { Until::Triangles(usize::MAX) } else { Until::Triangles(20) }
             };
             let built = build(&field, &rules(Metric::Normal, 1.0), until);
             for (d, whole) in &built.whole {

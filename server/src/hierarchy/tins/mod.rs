@@ -32,6 +32,7 @@ use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::Entry;
 use diamantina_protocol::message::TinLayer;
+use diamantina_protocol::tin::TRIANGLES_MAX;
 use halves::Halves;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, HashSet};
@@ -64,6 +65,9 @@ pub const PATCH_TRIANGLES: u32 = 1024;
 
 /// Triangles that may be asked for: the finest patches have up to 4096.
 pub const PATCH_TRIANGLES_RANGE: std::ops::RangeInclusive<u32> = 64..=8192;
+
+/// Triangles of a half, whatever error is asked: four are a payload, and this leaves some room.
+const HALF_TRIANGLES_MAX: usize = TRIANGLES_MAX / 16 * 3;
 
 /// The weight of borders, unless asked otherwise.
 pub const LAMBDA: f64 = 1.0;
@@ -230,7 +234,12 @@ impl Found {
 impl Tins<'_> {
     pub(super) fn rules(&self) -> Rules {
         let scale = Scale { cell: self.cell, quantum: self.stats.quantum };
-        Rules { metric: self.options.metric, lambda: self.options.lambda, scale }
+        Rules {
+            metric: self.options.metric,
+            lambda: self.options.lambda,
+            scale,
+            triangles_max: HALF_TRIANGLES_MAX,
+        }
     }
 
     /// Triangulates all that no earlier run has.

@@ -147,7 +147,7 @@ impl Tins<'_> {
                 let above = f64::from(self.forest.levels() - 1 - level);
                 self.limit(error * (above / 2.0).exp2(), ground(window))
             }
-            _ => Until::Triangles(2 * self.options.patch_triangles as usize),
+            _ => Until::Triangles(self.options.patch_triangles as usize),
         }
     }
 
