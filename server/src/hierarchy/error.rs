@@ -4,6 +4,7 @@ use super::transcribe::HEIGHT_METRES_MAX;
 use crate::ingest::IngestError;
 use crate::store::StoreError;
 use diamantina_protocol::bintree::ForestError;
+use diamantina_protocol::message::PAYLOAD_BYTES_MAX;
 use diamantina_protocol::points::{CodingError, SOURCE_MAX};
 use diamantina_protocol::tin::PatchError;
 use std::io;
@@ -96,6 +97,16 @@ pub enum BuildError {
         centre: [u32; 2],
         /// Why it cannot be coded.
         error: PatchError,
+    },
+    /// A patch takes more bytes than a client reads.
+    #[error(
+        "the triangles of diamond {centre:?} take {bytes} bytes, limit {PAYLOAD_BYTES_MAX}; give a smaller --patch-triangles or a larger --quantum"
+    )]
+    Payload {
+        /// The diamond.
+        centre: [u32; 2],
+        /// Bytes.
+        bytes: usize,
     },
     /// Our own steps were refused.
     #[error("steps: {0}")]

@@ -185,7 +185,11 @@ fn run(
     let stats = transcribe(source, &plan, &canvas, quantum, &before.bands, &work)?;
     let fine_step = fine_step(options.max_error, &stats)?;
     let done = AtomicU64::new(before.done());
-    let (plan, coding) = coding::coding(&plan, &canvas, options.rule, fine_step)?;
+    let (plan, coding) = if options.points {
+        coding::coding(&plan, &canvas, options.rule, fine_step)?
+    } else {
+        coding::without_points(&plan, options.rule, fine_step)?
+    };
     let build = Build {
         plan,
         canvas,

@@ -89,6 +89,8 @@ pub(super) struct Simplifier<'a> {
     pub(super) mesh: Mesh,
     /// By half-edges of the border.
     pub(super) passed: Passed,
+    /// Whether it is the mesh of the source, with nothing gone yet.
+    is_source: bool,
     square: Square,
     rules: &'a Rules,
     until: Until<'a>,
@@ -105,6 +107,7 @@ impl<'a> Simplifier<'a> {
     pub(super) fn new(
         mesh: Mesh,
         passed: Passed,
+        is_source: bool,
         square: Square,
         rules: &'a Rules,
         until: Until<'a>,
@@ -113,7 +116,7 @@ impl<'a> Simplifier<'a> {
         let roles = mesh.points.iter().map(|v| square.role(*v)).collect();
         let queue = Queue::new(mesh.points.len());
         let (star, other, ways) = (Star::default(), Star::default(), Vec::new());
-        Self { mesh, passed, square, rules, until, costs, roles, queue, star, other, ways }
+        Self { mesh, passed, is_source, square, rules, until, costs, roles, queue, star, other, ways }
     }
 
     /// Collapses until there is nothing left to do; on beyond an error as long as there are more triangles than a
@@ -121,7 +124,7 @@ impl<'a> Simplifier<'a> {
     pub(super) fn run(&mut self) {
         self.pass();
         if matches!(self.until, Until::Error { .. })
-            && self.mesh.live > self.halves() * self.rules.triangles_max
+            && self.mesh.live > self.halves().saturating_mul(self.rules.triangles_max)
         {
             self.until = Until::Triangles(self.rules.triangles_max);
             self.pass();
@@ -130,15 +133,15 @@ impl<'a> Simplifier<'a> {
 
     fn pass(&mut self) {
         for v in 0..u32::try_from(self.mesh.points.len()).unwrap_or(NONE) {
-            if self.mesh.is_live(v) {
+            if self.mesh.is_live(v) && self.may_go(v) {
                 self.enqueue(v);
             }
         }
         while let Some((_, v)) = self.queue.pop() {
-            self.mesh.look(v, &mut self.star);
-            if self.is_enough() {
+            if self.is_enough(v) {
                 continue;
             }
+            self.mesh.look(v, &mut self.star);
             self.find_ways();
             let ways = std::mem::take(&mut self.ways);
             if let Some((_, to)) = ways.iter().find(|(_, to)| self.is_allowed(*to)) {
@@ -153,11 +156,22 @@ impl<'a> Simplifier<'a> {
         1 + usize::from(self.square.upper.is_some())
     }
 
-    /// Whether the star's centre has to stay since there are few enough triangles.
-    fn is_enough(&self) -> bool {
+    /// Whether it is worth a look if a vertex may go: of the source's own mesh few may where nothing may be lost.
+    fn may_go(&self, v: u32) -> bool {
+        match self.until {
+            Until::Error { ground, vertical: 0.0, .. } if self.is_source => {
+                ground.may_be_plane(self.mesh.points[v as usize])
+            }
+            _ => true,
+        }
+    }
+
+    /// Whether a vertex has to stay since there are few enough triangles.
+    fn is_enough(&mut self, v: u32) -> bool {
         match self.until {
             Until::Triangles(target) => {
-                self.mesh.live <= self.halves() * target && !self.costs.importance(&self.mesh, &self.star).1
+                self.mesh.live <= self.halves().saturating_mul(target)
+                    && !self.costs.importance(&self.mesh, v, &mut self.other).1
             }
             Until::Error { .. } => false,
         }
@@ -167,8 +181,7 @@ impl<'a> Simplifier<'a> {
         if self.roles[v as usize] == Role::Locked {
             return;
         }
-        self.mesh.look(v, &mut self.other);
-        let (key, flat) = self.costs.importance(&self.mesh, &self.other);
+        let (key, flat) = self.costs.importance(&self.mesh, v, &mut self.other);
         // Where nothing may be lost, and something would be, there is no need to try.
         if matches!(self.until, Until::Error { vertical: 0.0, .. }) && !flat {
             self.queue.remove(v);

@@ -41,11 +41,38 @@ impl Ground<'_> {
         self.heights[j * self.width + i]
     }
 
+    /// How far a vertex is from its sample, if that lies in the rectangle and has a height.
+    fn off(&self, v: Vertex) -> f64 {
+        let step = |w: u32, o: u32| w.checked_sub(o).map(|w| w as usize);
+        let (Some(i), Some(j)) = (step(v.x, self.origin[0]), step(v.y, self.origin[1])) else { return 0.0 };
+        let sample = self.heights.get(j * self.width + i).filter(|h| i < self.width && **h != NODATA);
+        sample.map_or(0.0, |h| v.height.abs_diff(*h).into())
+    }
+
+    /// Whether the ground may be a plane around a sample: it is not where it bends along one axis. Only of samples whose
+    /// four neighbours lie in the rectangle and have heights it is known that it is not.
+    #[must_use]
+    pub(super) fn may_be_plane(&self, v: Vertex) -> bool {
+        let (i, j) = ((v.x - self.origin[0]) as usize, (v.y - self.origin[1]) as usize);
+        let (at, rows) = (j * self.width + i, self.heights.len() / self.width);
+        if i == 0 || j == 0 || i + 1 == self.width || j + 1 == rows {
+            return true;
+        }
+        let bends = |a: i32, b: i32| a != NODATA && b != NODATA && a + b != 2 * v.height;
+        let h = self.heights;
+        !bends(h[at - 1], h[at + 1]) && !bends(h[at - self.width], h[at + self.width])
+    }
+
     /// The largest distance, in quanta, between a triangle (which turns left) and the samples of the rectangle that it
     /// covers, or something above `limit` as soon as that is known. Samples without height count for nothing.
     #[must_use]
     pub fn distance(&self, [a, b, c]: [Vertex; 3], limit: f64) -> f64 {
-        let doubled = turn(a, b, c) as f64;
+        let doubled = turn(a, b, c);
+        if doubled == 1 {
+            // No other lattice point has room in it.
+            return [a, b, c].map(|v| self.off(v)).into_iter().fold(0.0, f64::max);
+        }
+        let doubled = doubled as f64;
         let local = |v: Vertex| {
             let step = |w: u32, o: u32| i64::from(w.wrapping_sub(o).cast_signed());
             [step(v.x, self.origin[0]), step(v.y, self.origin[1])]
@@ -96,9 +123,15 @@ fn span(corners: &[[i64; 2]; 3], y: i64, last: i64) -> Option<(i64, i64)> {
             east = east.max(x);
         }
     }
-    #[allow(clippy::cast_possible_truncation, reason = "coordinates are below 2^26")]
-    let (from, to) = ((west.ceil() as i64).max(0), (east.floor() as i64).min(last));
+    let (from, to) = (ceil(west).max(0), (-ceil(-east)).min(last));
     (west <= east && from <= to).then_some((from, to))
+}
+
+/// The least whole number at or above `x`. Without a call, which `f64::ceil` is where a machine is taken for an old one.
+#[allow(clippy::cast_possible_truncation, reason = "coordinates are below 2^26")]
+fn ceil(x: f64) -> i64 {
+    let toward_zero = x as i64;
+    toward_zero + i64::from((toward_zero as f64) < x)
 }
 
 /// The largest of `|h * doubled - (start + east * i)|` over a row.

@@ -205,6 +205,20 @@ impl Mesh {
         }
     }
 
+    /// Calls `visit` with each triangle around a vertex that is live, counterclockwise; whether the vertex lies at a
+    /// border.
+    pub(super) fn around(&self, v: u32, mut visit: impl FnMut(usize)) -> bool {
+        let start = self.first[v as usize];
+        let mut h = start;
+        loop {
+            visit(h as usize / 3);
+            h = self.twin(prev(h));
+            if h == NONE || h == start {
+                return h == NONE;
+            }
+        }
+    }
+
     fn link(&mut self, h: u32, twin: u32) {
         self.twins[h as usize] = twin;
         if twin != NONE {

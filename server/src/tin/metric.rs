@@ -132,27 +132,27 @@ impl Costs {
     }
 
     /// What a vertex is worth: those of the least go first. And whether its surroundings are a plane, so that nothing
-    /// is lost with it.
-    pub(super) fn importance(&self, mesh: &Mesh, star: &Star) -> (f64, bool) {
+    /// is lost with it. `star` is looked at where the triangles alone do not tell.
+    pub(super) fn importance(&self, mesh: &Mesh, v: u32, star: &mut Star) -> (f64, bool) {
         let (mut areas, mut sum) = (0.0, [0.0; 3]);
-        for spoke in &star.spokes {
-            let (vector, area) = self.vectors[*spoke as usize / 3];
+        let border = mesh.around(v, |t| {
+            let (vector, area) = self.vectors[t];
             areas += area;
             sum = [sum[0] + vector[0], sum[1] + vector[1], sum[2] + vector[2]];
-        }
-        let bend = if star.border {
-            self.lambda * self.bend(mesh, star, 0).min(self.bend(mesh, star, 1))
-        } else {
-            0.0
-        };
+        });
         let varies = areas - length(sum);
+        if !border && self.quadrics.is_empty() {
+            return (varies, varies <= FLAT * areas);
+        }
+        mesh.look(v, star);
+        let bend =
+            if border { self.lambda * self.bend(mesh, star, 0).min(self.bend(mesh, star, 1)) } else { 0.0 };
         let flat = varies <= FLAT * areas && bend <= FLAT * areas;
         if self.quadrics.is_empty() {
             return (varies + bend, flat);
         }
         // The least of what the ways out of here cost.
-        let ways = 0..star.rim.len();
-        let ways = ways.filter(|to| !star.border || *to == 0 || *to + 1 == star.rim.len());
+        let ways = (0..star.rim.len()).filter(|to| !border || *to == 0 || *to + 1 == star.rim.len());
         (ways.map(|to| self.quadric(mesh, star, to)).fold(f64::INFINITY, f64::min), flat)
     }
 

@@ -13,6 +13,10 @@
 //! along the diagonal of the bintree, without the triangles that have a corner without data: their edges are the
 //! source's border. A sample that belongs to no triangle (one alone, or in a thread of diagonal steps) is
 //! drawn at no level, and errors do not count it.
+//!
+//! What is drawn never grows beyond that: borders move inward alone, along themselves. So holes never close, and islands
+//! never vanish; where nodata tears so much that a payload has no room for all borders, the smallest triangles are left
+//! out, and the error is the diamond's width.
 
 mod collapse;
 mod ground;
@@ -58,6 +62,8 @@ pub struct Rules {
     pub scale: Scale,
     /// Triangles of each half of a diamond that are not exceeded for the sake of an error.
     pub triangles_max: usize,
+    /// Vertices of each half, likewise.
+    pub vertices_max: usize,
 }
 
 #[cfg(test)]

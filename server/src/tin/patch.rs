@@ -3,13 +3,13 @@
 use super::collapse::{Passed, Simplifier, Square, Until, distance_to};
 use super::ground::Ground;
 use super::mesh::{Mesh, NONE};
-use super::metric::turn;
+use super::metric::{between, length, turn};
 use super::{Rules, Vertex};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::tin::Patch;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 /// An edge of the border, from vertex to vertex, and the points of the source's border that it stands for, but for those
 /// on a straight line between others. It has the mesh to its left.
@@ -24,6 +24,8 @@ pub struct Tin {
     pub triangles: Vec<[u32; 3]>,
     /// Those borders along nodata that are not the source's own.
     pub borders: Vec<Border>,
+    /// How far what was left out since there was no room for it lies from what is there, in metres.
+    pub lost: f64,
 }
 
 /// The meshes of a diamond's four triangles as one.
@@ -33,6 +35,10 @@ pub struct Merged {
     pub patch: Patch,
     /// See [`Tin::borders`].
     pub borders: Vec<Border>,
+    /// See [`Tin::lost`].
+    pub lost: f64,
+    /// Whether it is the source's own mesh.
+    is_source: bool,
 }
 
 /// What became of a diamond.
@@ -74,7 +80,7 @@ pub fn source(forest: &Forest, d: Diamond, ground: Ground<'_>) -> Merged {
     let even = d.level().is_multiple_of(2);
     let columns = (high[0] - low[0] + 1) as usize;
     let mut numbers = vec![NONE; columns * (high[1] - low[1] + 1) as usize];
-    let mut merged = Merged::default();
+    let mut merged = Merged { is_source: true, ..Merged::default() };
     let inside = |corners: [[u32; 2]; 3]| {
         // The sum of the three corners, against three times each side.
         let (x, y) = (corners.iter().map(|c| c[0]).sum(), corners.iter().map(|c| c[1]).sum());
@@ -154,7 +160,7 @@ pub fn simplify(forest: &Forest, d: Diamond, merged: &Merged, rules: &Rules, unt
     let square = square(forest, d);
     let mesh = Mesh::new(&merged.patch.vertices, &merged.patch.triangles);
     let passed = find_passed(&mesh, merged);
-    let mut simplifier = Simplifier::new(mesh, passed, square, rules, until);
+    let mut simplifier = Simplifier::new(mesh, passed, merged.is_source, square, rules, until);
     simplifier.run();
     let Simplifier { mesh, passed, .. } = simplifier;
     let point = |v: u32| mesh.points[v as usize];
@@ -162,8 +168,55 @@ pub fn simplify(forest: &Forest, d: Diamond, merged: &Merged, rules: &Rules, unt
         let ends = [point(mesh.origin(*h)), point(mesh.target(*h))];
         points.iter().map(|p| distance_to(&rules.scale, *p, ends)).fold(0.0, f64::max)
     };
-    let apart = passed.iter().map(distance).fold(0.0, f64::max);
-    Simplified { halves: cut(&mesh, passed, &square), apart }
+    let apart = passed.iter().map(distance).fold(0.0, f64::max) + merged.lost;
+    let mut simplified = Simplified { halves: cut(&mesh, passed, &square), apart };
+    for half in &mut simplified.halves {
+        half.lost = merged.lost;
+        if half.triangles.len() > rules.triangles_max || half.vertices.len() > rules.vertices_max {
+            *half = with_room(half, rules);
+            // Wherever something was, something is no farther than the diamond is wide.
+            half.lost = length(between(&rules.scale, square.a, square.b));
+            simplified.apart = simplified.apart.max(half.lost);
+        }
+    }
+    simplified
+}
+
+/// The largest triangles of a half, as many as there may be. Only where nodata tears the ground to shreds can there be
+/// more that nothing but borders holds.
+fn with_room(half: &Tin, rules: &Rules) -> Tin {
+    let area = |t: &[u32; 3]| {
+        let [a, b, c] = t.map(|v| half.vertices[v as usize]);
+        turn(a, b, c)
+    };
+    let mut order: Vec<usize> = (0..half.triangles.len()).collect();
+    order.sort_by_key(|i| (std::cmp::Reverse(area(&half.triangles[*i])), *i));
+    let mut kept = Tin::default();
+    let mut numbers = vec![NONE; half.vertices.len()];
+    for i in order {
+        let t = half.triangles[i];
+        let fresh = t.iter().filter(|v| numbers[**v as usize] == NONE).count();
+        if kept.triangles.len() == rules.triangles_max || kept.vertices.len() + fresh > rules.vertices_max {
+            break;
+        }
+        kept.triangles.push(t.map(|v| {
+            let number = &mut numbers[v as usize];
+            if *number == NONE {
+                *number = u32::try_from(kept.vertices.len()).unwrap_or(NONE);
+                kept.vertices.push(half.vertices[v as usize]);
+            }
+            *number
+        }));
+    }
+    let edges: HashSet<[u32; 2]> =
+        kept.triangles.iter().flat_map(|t| (0..3).map(|i| [t[i], t[(i + 1) % 3]])).collect();
+    for (edge, points) in &half.borders {
+        let edge = edge.map(|v| numbers[v as usize]);
+        if edges.contains(&edge) {
+            kept.borders.push((edge, points.clone()));
+        }
+    }
+    kept
 }
 
 /// The half-edges of the borders that stand for more than themselves.

@@ -332,7 +332,7 @@ pub(super) fn fields() -> Vec<(&'static str, Field)> {
 const SCALE: Scale = Scale { cell: [30.0, 20.0], quantum: 0.5 };
 
 fn rules(metric: Metric, lambda: f64) -> Rules {
-    Rules { metric, lambda, scale: SCALE, triangles_max: usize::MAX }
+    Rules { metric, lambda, scale: SCALE, triangles_max: usize::MAX, vertices_max: usize::MAX }
 }
 
 /// A ground for limits that are given one by the builder.
@@ -415,6 +415,32 @@ fn what_is_free_to_go_goes_down_to_the_count() {
                 // The locked border has up to 16 edges a side on this lattice.
                 assert!(d.level() == finest || count <= 80, "{name}: {count} triangles of {d:?}");
             }
+        }
+    }
+}
+
+#[test]
+fn shreds_that_have_no_room_are_left_out_and_the_error_says_so() {
+    for (name, field) in fields() {
+        if !matches!(name, "torn" | "sieve") {
+            continue;
+        }
+        let tight = Rules { triangles_max: 60, vertices_max: 50, ..rules(Metric::Normal, 1.0) };
+        let built = build(&field, &tight, |_| Until::Triangles(20));
+        let mut wide = 0;
+        for whole in built.whole.values() {
+            for half in &whole.simplified.halves {
+                assert!(half.triangles.len() <= 60 && half.vertices.len() <= 50, "{name}");
+                wide += usize::from(half.lost > 0.0);
+                assert!(whole.simplified.apart >= half.lost);
+            }
+        }
+        assert!(wide > 0, "{name} is not torn enough for this test");
+        let mut dice = dice(77);
+        for _ in 0..6 {
+            let drawn = built.draw(|_| !dice().is_multiple_of(3));
+            assert_closed(&field.forest, &drawn, false);
+            assert_near(&field, &SCALE, &drawn);
         }
     }
 }

@@ -6,8 +6,9 @@
 //! | offset | size | field |
 //! |---|---|---|
 //! | 0 | 8 | XXH3 of what follows |
-//! | 8 | 4 + 4 + 4 | vertices v, triangles t, borders b |
-//! | 20 | 12 v | x, y, height |
+//! | 8 | 8 | how far what was left out lies from what is there, in metres |
+//! | 16 | 4 + 4 + 4 | vertices v, triangles t, borders b |
+//! | 28 | 12 v | x, y, height |
 //! | .. | 12 t, or 6 t where indices fit in 16 bits | indices |
 //! | .. | 12 b | two vertices, points |
 //! | .. | 8 a point | x, y |
@@ -122,6 +123,7 @@ const SHORT_MAX: usize = 1 << 16;
 fn write(tin: &Tin, out: &mut Vec<u8>) {
     let start = out.len();
     out.extend([0; 8]);
+    out.extend(tin.lost.to_le_bytes());
     let mut put = |number: u32| out.extend(number.to_le_bytes());
     for count in [tin.vertices.len(), tin.triangles.len(), tin.borders.len()] {
         put(u32::try_from(count).unwrap_or(u32::MAX));
@@ -152,14 +154,14 @@ fn read(bytes: &[u8]) -> Option<Tin> {
     if u64::from_le_bytes(*checksum) != xxh3_64(rest) {
         return None;
     }
-    let mut rest = rest;
+    let (lost, mut rest) = rest.split_first_chunk::<8>()?;
     let mut numbers = |count: usize| {
         let (now, later) = rest.split_at_checked(4 * count)?;
         rest = later;
         Some(now.as_chunks::<4>().0.iter().map(|b| u32::from_le_bytes(*b)))
     };
     let counts: Vec<usize> = numbers(3)?.map(|n| n as usize).collect();
-    let mut tin = Tin::default();
+    let mut tin = Tin { lost: f64::from_le_bytes(*lost), ..Tin::default() };
     let flat: Vec<u32> = numbers(3 * counts[0])?.collect();
     let vertex = |v: &[u32; 3]| Vertex { x: v[0], y: v[1], height: v[2].cast_signed() };
     tin.vertices = flat.as_chunks::<3>().0.iter().map(vertex).collect();
@@ -196,6 +198,7 @@ mod tests {
             vertices: (0..vertices).map(vertex).collect(),
             triangles: vec![[0, 1, vertices - 1], [2, 1, 0]],
             borders: vec![([0, 1], vec![[5, 6], [7, 8]]), ([1, 2], vec![])],
+            lost: 12.5,
         }
     }
 

@@ -66,8 +66,10 @@ pub const PATCH_TRIANGLES: u32 = 1024;
 /// Triangles that may be asked for: the finest patches have up to 4096.
 pub const PATCH_TRIANGLES_RANGE: std::ops::RangeInclusive<u32> = 64..=8192;
 
-/// Triangles of a half, whatever error is asked: four are a payload, and this leaves some room.
+/// Triangles of a half, whatever error is asked, and vertices, whatever nodata leaves: so that four of them fit in a
+/// payload of 256 KiB even if each vertex takes its 8 bytes.
 const HALF_TRIANGLES_MAX: usize = TRIANGLES_MAX / 16 * 3;
+const HALF_VERTICES_MAX: usize = 1 << 13;
 
 /// The weight of borders, unless asked otherwise.
 pub const LAMBDA: f64 = 1.0;
@@ -239,6 +241,7 @@ impl Tins<'_> {
             lambda: self.options.lambda,
             scale,
             triangles_max: HALF_TRIANGLES_MAX,
+            vertices_max: HALF_VERTICES_MAX,
         }
     }
 

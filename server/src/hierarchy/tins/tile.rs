@@ -12,6 +12,7 @@ use crate::store::{Key, Kind as BlobKind};
 use crate::tin::{Ground, Merged, Simplified, Tin, Until, half_of, merge, simplify, source};
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
+use diamantina_protocol::message::PAYLOAD_BYTES_MAX;
 use diamantina_protocol::tin;
 use rayon::prelude::*;
 use std::collections::HashMap;
@@ -123,6 +124,9 @@ impl Tins<'_> {
         }
         let payload =
             tin::encode(forest, d, &merged.patch).map_err(|error| BuildError::Patch { centre, error })?;
+        if payload.len() as u64 > u64::from(PAYLOAD_BYTES_MAX) {
+            return Err(BuildError::Payload { centre, bytes: payload.len() });
+        }
         let [a, b] = centre;
         let key = Key { layer: 0, kind: BlobKind::Tin, a, b };
         one.spot = Some(self.work.writer.put(key, BEHIND | blob_order(d), &payload)?);
