@@ -27,9 +27,9 @@ const SERVER: &[(&str, &[&str])] = &[
     ("chunks", &[]),
     ("measure", &[]),
     ("progress", &[]),
-    ("simplify", &[]),
+    ("tin", &[]),
     ("store", &[]),
-    ("hierarchy", &["canvas", "chunks", "ingest", "measure", "progress", "simplify", "store"]),
+    ("hierarchy", &["canvas", "chunks", "ingest", "measure", "progress", "store", "tin"]),
     ("inspect", &["chunks", "store"]),
     ("height", &["inspect", "projection", "store"]),
     ("stream", &["inspect", "store"]),
@@ -41,17 +41,7 @@ const SERVER: &[(&str, &[&str])] = &[
     ("zone", &["height", "inspect", "progress", "projection", "store"]),
     (
         "experiment",
-        &[
-            "canvas",
-            "client_program",
-            "hierarchy",
-            "http",
-            "ingest",
-            "measure",
-            "progress",
-            "simplify",
-            "zone",
-        ],
+        &["canvas", "client_program", "hierarchy", "http", "ingest", "measure", "progress", "zone"],
     ),
 ];
 
