@@ -19,6 +19,8 @@ mod heights;
 mod hostile;
 /// What the server answers to whom: routes, caches, refusals, heights.
 mod http;
+/// Who asks too much, too slowly or for nothing does not disturb the others.
+mod limits;
 /// A slow and distant link, and that it is as slow and distant as asked.
 mod link;
 /// Progressive streams: what any prefix is worth, who may ask for what, and the client that draws from one.

@@ -2,7 +2,7 @@
 
 use diamantina_client::terrain::{self, Terrain};
 use diamantina_server::hierarchy::{self, Report};
-use diamantina_server::http::Server;
+use diamantina_server::http::{Limits, Server};
 use diamantina_server::progress::Progress;
 use diamantina_server::{ingest, sample};
 use std::io::{Read, Write};
@@ -140,7 +140,12 @@ pub(crate) struct Served {
 
 /// Serves stores on a free port.
 pub(crate) fn serve(stores: &[PathBuf]) -> Served {
-    let server = Server::open(stores, "127.0.0.1:0".parse().unwrap()).unwrap();
+    serve_within(stores, Limits::default())
+}
+
+/// Serves stores on a free port, within limits.
+pub(crate) fn serve_within(stores: &[PathBuf], limits: Limits) -> Served {
+    let server = Server::open(stores, "127.0.0.1:0".parse().unwrap()).unwrap().within(limits);
     let address = server.address();
     let (stop, stopped) = tokio::sync::oneshot::channel();
     std::thread::spawn(move || {

@@ -5,6 +5,12 @@
 //! The handlers read from local files, which the system caches: a read takes microseconds, so only whole
 //! batches and heights leave the async threads.
 
+mod accept;
+mod limits;
+mod still;
+
+pub use limits::Limits;
+
 use crate::height::{self, HeightError};
 use crate::store::{Key, Kind, Store, StoreError, zones};
 use crate::stream::Stream;
@@ -12,7 +18,7 @@ use axum::Router;
 use axum::body::{Body, Bytes};
 use axum::extract::{Path as UrlPath, Query, Request, State};
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
-use axum::middleware::{self, Next};
+use axum::middleware::Next;
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
 use diamantina_protocol::bintree::Forest;
@@ -26,9 +32,6 @@ use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
-
-/// The longest that a shutdown waits for answers under way.
-const DRAIN: Duration = Duration::from_secs(10);
 
 /// Frames of a batch that may wait for a slow reader.
 const FRAMES_AHEAD: usize = 16;
@@ -81,6 +84,7 @@ pub struct Server {
     scenes: Scenes,
     listener: TcpListener,
     address: SocketAddr,
+    limits: Limits,
 }
 
 impl Server {
@@ -103,7 +107,13 @@ impl Server {
         let listener = TcpListener::bind(listen).map_err(failed)?;
         listener.set_nonblocking(true).map_err(failed)?;
         let address = listener.local_addr().map_err(failed)?;
-        Ok(Self { scenes: Arc::new(scenes), listener, address })
+        Ok(Self { scenes: Arc::new(scenes), listener, address, limits: Limits::default() })
+    }
+
+    /// The same with other limits than [`Limits::default`].
+    #[must_use]
+    pub fn within(self, limits: Limits) -> Self {
+        Self { limits, ..self }
     }
 
     /// Where the server listens, as a URL.
@@ -143,21 +153,7 @@ impl Server {
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         runtime.block_on(async move {
             let listener = tokio::net::TcpListener::from_std(self.listener)?;
-            let (stopping, stopped) = tokio::sync::oneshot::channel();
-            let signalled = async move {
-                stop.await;
-                let _ = stopping.send(());
-            };
-            let serving =
-                axum::serve(listener, router(self.scenes)).with_graceful_shutdown(signalled).into_future();
-            let deadline = async move {
-                // Connections that stay open for nothing do not keep the process.
-                if stopped.await.is_err() {
-                    std::future::pending::<()>().await;
-                }
-                tokio::time::sleep(DRAIN).await;
-            };
-            tokio::select! { served = serving => served?, () = deadline => {} }
+            accept::serve(listener, router(self.scenes), self.limits, stop).await;
             Ok(())
         })
     }
@@ -207,7 +203,6 @@ pub fn router(scenes: Scenes) -> Router {
         .method_not_allowed_fallback(|| async {
             Refusal::new(StatusCode::METHOD_NOT_ALLOWED, "only GET and HEAD are answered")
         })
-        .layer(middleware::from_fn(common_headers))
         .with_state(scenes)
 }
 

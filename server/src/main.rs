@@ -139,6 +139,8 @@ struct ServeArgs {
     /// The address to listen on; port 0 picks a free one
     #[arg(long, default_value = "127.0.0.1:8080", value_name = "ADDRESS:PORT")]
     listen: SocketAddr,
+    #[command(flatten)]
+    limits: http::Limits,
 }
 
 #[derive(Args)]
@@ -304,7 +306,7 @@ fn main() -> ExitCode {
     log.with_writer(std::io::stderr).init();
     let result = match Cli::parse().command {
         Command::Build(args) => build(*args),
-        Command::Serve(args) => serve(&args.stores, args.listen),
+        Command::Serve(args) => serve(&args),
         Command::Inspect(args) => inspect_store(&args),
         Command::Zone(args) => compute_zone(*args),
         Command::Demo(args) => demonstrate(&args),
@@ -534,8 +536,8 @@ fn print_report(out: &mut impl Write, store: &Path, report: &Report) -> std::io:
     writeln!(out, "Next: diamantina-server serve {}", store.display())
 }
 
-fn serve(stores: &[PathBuf], listen: SocketAddr) -> Result<(), Failure> {
-    let server = http::Server::open(stores, listen)?;
+fn serve(args: &ServeArgs) -> Result<(), Failure> {
+    let server = http::Server::open(&args.stores, args.listen)?.within(args.limits);
     let mut out = std::io::stdout().lock();
     let printed = writeln!(out, "Serving {} at {}", server.scenes().join(", "), server.address());
     shown(printed.and_then(|()| out.flush()))?;
