@@ -7,9 +7,11 @@
 
 mod accept;
 mod limits;
+mod scenes;
 mod still;
 
 pub use limits::Limits;
+pub use scenes::Scenes;
 
 use crate::height::{self, HeightError};
 use crate::store::{Key, Kind, Store, StoreError, zones};
@@ -26,7 +28,8 @@ use diamantina_protocol::index;
 use diamantina_protocol::message::{
     self, BATCH_MAX, Catalogue, FrameHeader, Layer, PAYLOAD_BYTES_MAX, Problem, STREAM_MAX, Scene, Status,
 };
-use std::collections::{BTreeMap, HashMap};
+use scenes::Found;
+use std::collections::HashMap;
 use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::PathBuf;
@@ -75,13 +78,10 @@ pub enum ServeError {
     Run(#[from] std::io::Error),
 }
 
-/// Scenes by name.
-type Scenes = Arc<BTreeMap<String, Arc<Store>>>;
-
 /// A server that has its stores open and its port bound.
 #[derive(Debug)]
 pub struct Server {
-    scenes: Scenes,
+    scenes: Arc<Scenes>,
     listener: TcpListener,
     address: SocketAddr,
     limits: Limits,
@@ -93,16 +93,7 @@ impl Server {
     /// # Errors
     /// When a store is missing or damaged, or the port is in use.
     pub fn open(stores: &[PathBuf], listen: SocketAddr) -> Result<Self, ServeError> {
-        let mut scenes: BTreeMap<String, Arc<Store>> = BTreeMap::new();
-        for path in stores {
-            let store = Store::open(path)?;
-            let name = store.scene().name.clone();
-            if let Some(first) = scenes.get(&name) {
-                let (first, second) = (first.root().to_owned(), path.clone());
-                return Err(ServeError::SameName { name, first, second });
-            }
-            scenes.insert(name, Arc::new(store));
-        }
+        let scenes = Scenes::open(stores)?;
         let failed = |error| ServeError::Listen { address: listen, error };
         let listener = TcpListener::bind(listen).map_err(failed)?;
         listener.set_nonblocking(true).map_err(failed)?;
@@ -125,7 +116,7 @@ impl Server {
     /// The names of its scenes.
     #[must_use]
     pub fn scenes(&self) -> Vec<String> {
-        self.scenes.keys().cloned().collect()
+        self.scenes.all().iter().map(|store| store.scene().name.clone()).collect()
     }
 
     /// Serves until the process is interrupted or terminated, then lets answers under way end.
@@ -153,9 +144,26 @@ impl Server {
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         runtime.block_on(async move {
             let listener = tokio::net::TcpListener::from_std(self.listener)?;
+            if self.limits.reload > 0 {
+                tokio::spawn(watch(Arc::clone(&self.scenes), self.limits));
+            }
             accept::serve(listener, router(self.scenes), self.limits, stop).await;
             Ok(())
         })
+    }
+}
+
+/// Looks for other versions of the scenes, as long as the server runs.
+async fn watch(scenes: Arc<Scenes>, limits: Limits) {
+    let mut ticks = tokio::time::interval(Duration::from_secs(limits.reload.into()));
+    ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    loop {
+        ticks.tick().await;
+        let (scenes, grace) = (Arc::clone(&scenes), Duration::from_secs(limits.grace.into()));
+        // Reading a whole store takes its time, and none of the others'.
+        if tokio::task::spawn_blocking(move || scenes.refresh(grace)).await.is_err() {
+            tracing::error!("looking for other versions failed; it is tried again");
+        }
     }
 }
 
@@ -181,7 +189,7 @@ pub fn ask_health(address: SocketAddr) -> Result<(), String> {
 }
 
 /// The requests that the scenes answer.
-pub fn router(scenes: Scenes) -> Router {
+pub fn router(scenes: Arc<Scenes>) -> Router {
     Router::new()
         .route("/", get(front_page))
         .route("/health", get(|| async { "ok\n" }))
@@ -284,13 +292,14 @@ fn json(headers: &HeaderMap, value: &impl serde::Serialize) -> Response {
     tagged(headers, &hash[..16], "no-cache", "application/json", || body.into())
 }
 
-async fn front_page(State(scenes): State<Scenes>) -> Html<String> {
+async fn front_page(State(scenes): State<Arc<Scenes>>) -> Html<String> {
     let mut page = String::from(
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content=\"width=device-width\"><title>Diamantina</title>\
          <style>body{font:16px/1.5 system-ui;max-width:44rem;margin:3rem auto;padding:0 1rem}code{background:#eee;padding:.1em .3em}</style>\
          <h1>Diamantina</h1><p>This server streams terrain. Open a scene with the client:</p><ul>",
     );
-    for name in scenes.keys() {
+    for store in scenes.all() {
+        let name = &store.scene().name;
         // Names are letters, digits, '-', '_' and '.': nothing to escape.
         page += &format!(
             "<li><a href=/scenes/{name}>{name}</a> <code>diamantina-client render http://THIS-SERVER/scenes/{name} -o {name}.png</code>"
@@ -300,15 +309,17 @@ async fn front_page(State(scenes): State<Scenes>) -> Html<String> {
     Html(page)
 }
 
-async fn catalogue(State(scenes): State<Scenes>, headers: HeaderMap) -> Response {
-    let scenes: Vec<Scene> = scenes.values().map(|s| s.scene().clone()).collect();
+async fn catalogue(State(scenes): State<Arc<Scenes>>, headers: HeaderMap) -> Response {
+    let scenes: Vec<Scene> = scenes.all().iter().map(|s| s.scene().clone()).collect();
     json(&headers, &Catalogue { scenes })
 }
 
-fn find_scene<'a>(scenes: &'a Scenes, name: &str) -> Result<&'a Arc<Store>, Refusal> {
-    scenes
-        .get(name)
-        .ok_or_else(|| Refusal::new(StatusCode::NOT_FOUND, "no such scene: GET /scenes lists them"))
+fn find_scene(scenes: &Scenes, name: &str) -> Result<Arc<Store>, Refusal> {
+    scenes.newest(name).ok_or_else(no_scene)
+}
+
+fn no_scene() -> Refusal {
+    Refusal::new(StatusCode::NOT_FOUND, "no such scene: GET /scenes lists them")
 }
 
 /// The layer of an address, with its number.
@@ -320,20 +331,18 @@ fn find_layer<'a>(store: &'a Store, name: &str) -> Result<(u8, &'a Layer), Refus
 }
 
 /// The store of an address with a version.
-fn find_version<'a>(scenes: &'a Scenes, name: &str, version: &str) -> Result<&'a Arc<Store>, Refusal> {
-    let store = find_scene(scenes, name)?;
-    let current = &store.scene().version;
-    if current == version {
-        return Ok(store);
+fn find_version(scenes: &Scenes, name: &str, version: &str) -> Result<Arc<Store>, Refusal> {
+    match scenes.at(name, version).ok_or_else(no_scene)? {
+        Found::Store(store) => Ok(store),
+        Found::Gone(current) => Err(Refusal::new(
+            StatusCode::GONE,
+            format!("scene '{name}' is now at version {current}: load its description again"),
+        )),
     }
-    Err(Refusal::new(
-        StatusCode::GONE,
-        format!("scene '{name}' is now at version {current}: load its description again"),
-    ))
 }
 
 async fn scene(
-    State(scenes): State<Scenes>,
+    State(scenes): State<Arc<Scenes>>,
     UrlPath(name): UrlPath<String>,
     headers: HeaderMap,
 ) -> Result<Response, Refusal> {
@@ -377,35 +386,43 @@ type DiamondPath = UrlPath<(String, String, String, String, String)>;
 type BatchPath = UrlPath<(String, String, String)>;
 type Ask = Query<HashMap<String, String>>;
 
-async fn index_page(state: State<Scenes>, path: PagePath, headers: HeaderMap) -> Result<Response, Refusal> {
+async fn index_page(
+    state: State<Arc<Scenes>>,
+    path: PagePath,
+    headers: HeaderMap,
+) -> Result<Response, Refusal> {
     page_of(&state, path, &headers, points)
 }
 
 async fn tin_index_page(
-    state: State<Scenes>,
+    state: State<Arc<Scenes>>,
     path: PagePath,
     headers: HeaderMap,
 ) -> Result<Response, Refusal> {
     page_of(&state, path, &headers, tin)
 }
 
-async fn diamond(state: State<Scenes>, path: DiamondPath, headers: HeaderMap) -> Result<Response, Refusal> {
+async fn diamond(
+    state: State<Arc<Scenes>>,
+    path: DiamondPath,
+    headers: HeaderMap,
+) -> Result<Response, Refusal> {
     diamond_of(&state, path, &headers, points)
 }
 
 async fn tin_diamond(
-    state: State<Scenes>,
+    state: State<Arc<Scenes>>,
     path: DiamondPath,
     headers: HeaderMap,
 ) -> Result<Response, Refusal> {
     diamond_of(&state, path, &headers, tin)
 }
 
-async fn batch(state: State<Scenes>, path: BatchPath, query: Ask) -> Result<Response, Refusal> {
+async fn batch(state: State<Arc<Scenes>>, path: BatchPath, query: Ask) -> Result<Response, Refusal> {
     batch_of(&state, path, &query, points)
 }
 
-async fn tin_batch(state: State<Scenes>, path: BatchPath, query: Ask) -> Result<Response, Refusal> {
+async fn tin_batch(state: State<Arc<Scenes>>, path: BatchPath, query: Ask) -> Result<Response, Refusal> {
     batch_of(&state, path, &query, tin)
 }
 
@@ -416,7 +433,7 @@ fn page_of(
     encoding: fn(&Layer) -> Result<Encoding, Refusal>,
 ) -> Result<Response, Refusal> {
     let store = find_version(scenes, &name, &version)?;
-    let (number, layer) = find_layer(store, &layer)?;
+    let (number, layer) = find_layer(&store, &layer)?;
     let encoding = encoding(layer)?;
     let pages = index::pages(&encoding.forest);
     let missing = || {
@@ -429,7 +446,7 @@ fn page_of(
 }
 
 async fn zone(
-    State(scenes): State<Scenes>,
+    State(scenes): State<Arc<Scenes>>,
     UrlPath((name, version, zone)): UrlPath<(String, String, String)>,
     headers: HeaderMap,
 ) -> Result<Response, Refusal> {
@@ -448,7 +465,7 @@ fn diamond_of(
     encoding: fn(&Layer) -> Result<Encoding, Refusal>,
 ) -> Result<Response, Refusal> {
     let store = find_version(scenes, &name, &version)?;
-    let (number, layer) = find_layer(store, &layer)?;
+    let (number, layer) = find_layer(&store, &layer)?;
     let encoding = encoding(layer)?;
     let no_diamond = || Refusal::new(StatusCode::NOT_FOUND, "no diamond with a payload has its centre there");
     let centre = [x.parse().map_err(|_| no_diamond())?, y.parse().map_err(|_| no_diamond())?];
@@ -466,7 +483,7 @@ fn batch_of(
     query: &HashMap<String, String>,
     encoding: fn(&Layer) -> Result<Encoding, Refusal>,
 ) -> Result<Response, Refusal> {
-    let store = Arc::clone(find_version(scenes, &name, &version)?);
+    let store = find_version(scenes, &name, &version)?;
     let (number, Encoding { forest, payload, .. }) = {
         let (number, layer) = find_layer(&store, &layer)?;
         (number, encoding(layer)?)
@@ -520,12 +537,12 @@ fn batch_frame(store: &Store, layer: u8, kind: Kind, centre: [u32; 2]) -> Bytes 
 }
 
 async fn stream(
-    State(scenes): State<Scenes>,
+    State(scenes): State<Arc<Scenes>>,
     UrlPath((name, version, layer)): UrlPath<(String, String, String)>,
     Query(query): Query<Vec<(String, String)>>,
     headers: HeaderMap,
 ) -> Result<Response, Refusal> {
-    let store = Arc::clone(find_version(&scenes, &name, &version)?);
+    let store = find_version(&scenes, &name, &version)?;
     let (number, layer) = find_layer(&store, &layer)?;
     points(layer)?;
     let ask = message::parse_stream(query.iter().map(|(name, value)| (name.as_str(), value.as_str())))
@@ -556,11 +573,11 @@ fn pieces(stream: Stream) -> impl futures_util::Stream<Item = Result<Bytes, std:
 }
 
 async fn height_at(
-    State(scenes): State<Scenes>,
+    State(scenes): State<Arc<Scenes>>,
     UrlPath((name, layer)): UrlPath<(String, String)>,
     Query(query): Query<HashMap<String, String>>,
 ) -> Result<Response, Refusal> {
-    let store = Arc::clone(find_scene(&scenes, &name)?);
+    let store = find_scene(&scenes, &name)?;
     points(find_layer(&store, &layer)?.1)?;
     let number = |key: &str| -> Result<Option<f64>, Refusal> {
         let Some(text) = query.get(key) else { return Ok(None) };

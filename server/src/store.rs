@@ -707,6 +707,14 @@ impl Store {
         Ok(Self { root: root.to_owned(), scene: manifest.scene, packs, places })
     }
 
+    /// The version that is published at `root`, whatever is open.
+    ///
+    /// # Errors
+    /// When there is no store, or one of another format.
+    pub fn published(root: &Path) -> Result<String, StoreError> {
+        Ok(Manifest::read(root)?.scene.version)
+    }
+
     /// The folder.
     #[must_use]
     pub fn root(&self) -> &Path {

@@ -1,4 +1,4 @@
-//! What a server allows those who ask: how many at once, for how long, and how much.
+//! What a server allows those who ask (how many at once, for how long, and how much), and when it changes what it serves.
 
 use std::time::Duration;
 
@@ -20,6 +20,12 @@ pub struct Limits {
     /// balancers to notice
     #[arg(long, default_value_t = 0, value_name = "SECONDS")]
     pub shutdown_notice: u32,
+    /// Seconds between looks for other versions of the scenes; 0: only those at the start are served
+    #[arg(long, default_value_t = 5, value_name = "SECONDS")]
+    pub reload: u32,
+    /// Seconds for which a version is served after another took its place
+    #[arg(long, default_value_t = 300, value_name = "SECONDS")]
+    pub grace: u32,
     /// How long the head of a request may take.
     #[arg(skip = Duration::from_secs(10))]
     pub head: Duration,
@@ -53,6 +59,8 @@ impl Default for Limits {
             max_connections_per_address: 256,
             max_in_flight: 1024,
             shutdown_notice: 0,
+            reload: 5,
+            grace: 300,
             head: Duration::from_secs(10),
             still: Duration::from_secs(30),
             answer: Duration::from_secs(600),

@@ -1,0 +1,147 @@
+//! The scenes that are served, each at its newest version that is sound, and the versions before for a while.
+//!
+//! A build publishes by renaming `scene.json`. The server looks at it now and then; a version that it does not know is
+//! opened and read through before anybody is sent to it, so that a bad one never replaces a good one. Who is at the
+//! version before goes on with it: its files stay open even where the build has removed them.
+
+use super::ServeError;
+use crate::store::{Store, StoreError};
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::{Arc, PoisonError, RwLock};
+use std::time::{Duration, Instant};
+
+/// How long a version that is not sound is left alone.
+const LEFT_ALONE: Duration = Duration::from_secs(60);
+
+/// Scenes by name.
+#[derive(Debug)]
+pub struct Scenes(RwLock<BTreeMap<String, Shown>>);
+
+#[derive(Debug)]
+struct Shown {
+    now: Arc<Store>,
+    /// Versions before, and until when they are served.
+    before: Vec<(Arc<Store>, Instant)>,
+    /// A version that is not sound, and since when that is known.
+    refused: Option<(String, Instant)>,
+}
+
+/// What there is at a version.
+pub(super) enum Found {
+    Store(Arc<Store>),
+    /// Another version took its place.
+    Gone(String),
+}
+
+impl Scenes {
+    /// Opens the stores.
+    pub(super) fn open(stores: &[PathBuf]) -> Result<Self, ServeError> {
+        let mut scenes: BTreeMap<String, Shown> = BTreeMap::new();
+        for path in stores {
+            let store = Store::open(path)?;
+            let name = store.scene().name.clone();
+            if let Some(first) = scenes.get(&name) {
+                let (first, second) = (first.now.root().to_owned(), path.clone());
+                return Err(ServeError::SameName { name, first, second });
+            }
+            scenes.insert(name, Shown { now: Arc::new(store), before: Vec::new(), refused: None });
+        }
+        Ok(Self(RwLock::new(scenes)))
+    }
+
+    fn read<T>(&self, look: impl FnOnce(&BTreeMap<String, Shown>) -> T) -> T {
+        look(&self.0.read().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    fn change(&self, name: &str, change: impl FnOnce(&mut Shown)) {
+        if let Some(shown) = self.0.write().unwrap_or_else(PoisonError::into_inner).get_mut(name) {
+            change(shown);
+        }
+    }
+
+    /// The newest version of every scene.
+    pub(super) fn all(&self) -> Vec<Arc<Store>> {
+        self.read(|scenes| scenes.values().map(|shown| Arc::clone(&shown.now)).collect())
+    }
+
+    /// The newest version of a scene.
+    pub(super) fn newest(&self, name: &str) -> Option<Arc<Store>> {
+        self.read(|scenes| scenes.get(name).map(|shown| Arc::clone(&shown.now)))
+    }
+
+    /// A scene at a version.
+    pub(super) fn at(&self, name: &str, version: &str) -> Option<Found> {
+        self.read(|scenes| {
+            let shown = scenes.get(name)?;
+            let is_asked = |store: &Arc<Store>| store.scene().version == version;
+            if is_asked(&shown.now) {
+                return Some(Found::Store(Arc::clone(&shown.now)));
+            }
+            let now = Instant::now();
+            let before = shown.before.iter().find(|(store, until)| is_asked(store) && *until > now);
+            Some(before.map_or_else(
+                || Found::Gone(shown.now.scene().version.clone()),
+                |(store, _)| Found::Store(Arc::clone(store)),
+            ))
+        })
+    }
+
+    /// Looks whether other versions were published, and goes over to those that are sound. Versions before are
+    /// served for `grace` more.
+    pub(super) fn refresh(&self, grace: Duration) {
+        for store in self.all() {
+            let name = &store.scene().name;
+            self.change(name, |shown| shown.before.retain(|(_, until)| *until > Instant::now()));
+            let refuse = |version: &str, reason: &dyn std::fmt::Display| {
+                tracing::error!(scene = name, version, %reason, "another version was published, and is not served");
+                self.change(name, |shown| shown.refused = Some((version.to_owned(), Instant::now())));
+            };
+            let version = match Store::published(store.root()) {
+                Ok(version) if version == store.scene().version => continue,
+                Ok(version) => version,
+                Err(error) => {
+                    self.refuse_once(name, "", || refuse("", &error));
+                    continue;
+                }
+            };
+            self.refuse_once(name, &version, || match sound(&store) {
+                Ok(newer) if newer.scene().name == *name => {
+                    tracing::info!(
+                        scene = name,
+                        version = newer.scene().version,
+                        "another version is served"
+                    );
+                    self.change(name, |shown| {
+                        let before = std::mem::replace(&mut shown.now, Arc::new(newer));
+                        shown.before.push((before, Instant::now() + grace));
+                        shown.refused = None;
+                    });
+                }
+                Ok(newer) => refuse(&version, &format!("it is of a scene named '{}'", newer.scene().name)),
+                Err(error) => refuse(&version, &error),
+            });
+        }
+    }
+
+    /// Does something about a version, unless it was refused not long ago.
+    fn refuse_once(&self, name: &str, version: &str, act: impl FnOnce()) {
+        let is_refused = self.read(|scenes| {
+            let refused = scenes.get(name).and_then(|shown| shown.refused.as_ref());
+            refused.is_some_and(|(refused, since)| refused == version && since.elapsed() < LEFT_ALONE)
+        });
+        if !is_refused {
+            act();
+        }
+    }
+}
+
+/// What is published where a store is from, if every blob of it is as it was written.
+fn sound(store: &Store) -> Result<Store, StoreError> {
+    let newer = Store::open(store.root())?;
+    let keys: Vec<_> = newer.keys().map(|(key, _)| key).collect();
+    for key in keys {
+        newer.get(key)?;
+    }
+    Ok(newer)
+}
