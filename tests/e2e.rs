@@ -31,6 +31,8 @@ mod resume;
 mod seams;
 /// Streaming from end to end: pictures, bytes, flights with late data.
 mod stream;
+/// A scene built again while it is served: nobody is refused, and a bad version never replaces a good one.
+mod swap;
 /// The house: who may import whom, how long a file may be.
 mod tidy;
 /// Law 3: declared errors hold at every sample of real DEMs.

@@ -59,7 +59,7 @@ pub(crate) struct Options {
     pub(crate) angle: f64,
 }
 
-const COLUMNS: [&str; 12] = [
+const COLUMNS: [&str; 14] = [
     "DEM",
     "mesh",
     "tolerance",
@@ -72,6 +72,8 @@ const COLUMNS: [&str; 12] = [
     "azimuths off by more than 1 px without mask [%]",
     "skyline off with mask [px]",
     "azimuths off by more than 1 px with mask [%]",
+    "places under the mesh",
+    "places under the masked mesh",
 ];
 
 pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
@@ -90,21 +92,29 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
         &["DEM", "zone", "samples", "eyes", "in the zone [%]", "seen [%]", "hidden [%]", "seconds"],
     );
     let mut pictures = Vec::new();
+    let mut notes = Vec::new();
     for (i, window) in run.windows.iter().enumerate() {
-        one(run, i, window, [&mut table, &mut masks], &mut pictures)?;
+        match one(run, i, window, [&mut table, &mut masks], &mut pictures) {
+            // Of many windows some have no lake.
+            Err(ExperimentError::Options { option: "--polygon", found, .. }) if run.windows.len() > 1 => {
+                notes.push(format!("{} at {:?} is left out: {found}.", window.source, window.at));
+            }
+            done => done?,
+        }
     }
-    let notes = vec![
+    notes.extend([
         format!(
             "Eyes stand {} m above the zone's highest ground. Hidden ground counts for {hidden}, and for more \
-             where it is hidden by less than a pixel over that; a pixel is {ANGLE} radians.",
+             where it is hidden by less than {angle} radians over that. A pixel is {ANGLE} radians.",
             run.options.eye
         ),
         format!(
             "Skylines from {PLACES} places in the zone, compared at each half pixel: the largest difference, and the \
-             share of the azimuths that differ by more than a pixel. Surfaces are drawn through the heights \
+             share of the azimuths that differ by more than a pixel. Places that a coarse mesh covers have no \
+             skyline; they are counted. Surfaces are drawn through the heights \
              that a mesh has at every sample."
         ),
-    ];
+    ]);
     Ok(Report { title: "Visibility from a zone".to_owned(), notes, tables: vec![table, masks], pictures })
 }
 
@@ -245,10 +255,14 @@ fn from_polygon(
             "a region within the window of {}, from ({}, {}) to ({}, {}) in its metres",
             window.source, low[0], low[1], high[0], high[1]
         );
-        return Err(wrong(
-            expected,
-            format!("{} reaches beyond; choose with --at and --samples", path.display()),
-        ));
+        let corners = || polygons.iter().flatten().flatten();
+        let [west, south] = [0, 1].map(|k| corners().map(|p| p[k]).fold(f64::INFINITY, f64::min).round());
+        let [east, north] = [0, 1].map(|k| corners().map(|p| p[k]).fold(f64::NEG_INFINITY, f64::max).round());
+        let found = format!(
+            "{} from ({west}, {south}) to ({east}, {north}); choose the window with --at and --samples",
+            path.display()
+        );
+        return Err(wrong(expected, found));
     }
     let heights = polygons.iter().filter_map(|rings| ground.highest(rings));
     let none = || wrong("a region with data".to_owned(), format!("none in {}", path.display()));
@@ -348,7 +362,7 @@ struct Sight<'a> {
     window: &'a Window,
     eyes: Vec<Eye>,
     /// By eye and azimuth: angles in pixels.
-    full: Vec<Vec<f64>>,
+    full: Vec<Option<Vec<f64>>>,
 }
 
 impl<'a> Sight<'a> {
@@ -368,7 +382,8 @@ impl<'a> Sight<'a> {
         sight
     }
 
-    fn skylines(&self, heights: &[f64]) -> Vec<Vec<f64>> {
+    /// Of a place that the surface covers there is none.
+    fn skylines(&self, heights: &[f64]) -> Vec<Option<Vec<f64>>> {
         let ground = ground(self.window, heights);
         let optics = Optics {
             cell: ground.cell,
@@ -379,6 +394,9 @@ impl<'a> Sight<'a> {
             angle: 0.0,
         };
         let of = |eye: &Eye| {
+            if ground.relief.height(eye.place).is_some_and(|height| height >= eye.height) {
+                return None;
+            }
             let azimuths = (TAU / ANGLE * 2.0).ceil();
             #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "some thousands")]
             let skyline = (0..azimuths as u32).map(|i| {
@@ -388,15 +406,17 @@ impl<'a> Sight<'a> {
                 });
                 (highest * QUANTUM).atan() / ANGLE
             });
-            skyline.collect()
+            Some(skyline.collect())
         };
         self.eyes.par_iter().map(of).collect()
     }
 
-    /// The largest difference in pixels, and the percentage of the azimuths that differ by more than one.
-    fn difference(a: &[Vec<f64>], b: &[Vec<f64>]) -> [f64; 2] {
+    /// The largest difference in pixels, and the percentage of the azimuths that differ by more than one, over the
+    /// places that neither surface covers.
+    fn difference(a: &[Option<Vec<f64>>], b: &[Option<Vec<f64>>]) -> [f64; 2] {
         let (mut largest, mut moved, mut all) = (0.0f64, 0u32, 0u32);
-        for (a, b) in a.iter().flatten().zip(b.iter().flatten()) {
+        let both = a.iter().zip(b).filter_map(|(a, b)| a.as_ref().zip(b.as_ref()));
+        for (a, b) in both.flat_map(|(a, b)| a.iter().zip(b)) {
             let apart = (a - b).abs();
             largest = largest.max(apart);
             moved += u32::from(apart > 1.0);
@@ -407,13 +427,14 @@ impl<'a> Sight<'a> {
 
     fn row(&self, [mesh, tolerance]: [&str; 2], counts: [usize; 2], surfaces: &[Vec<f64>; 2]) -> Vec<String> {
         let [plain, masked] = surfaces.each_ref().map(|heights| self.skylines(heights));
+        let covered = [&plain, &masked].map(|all| all.iter().filter(|one| one.is_none()).count().to_string());
         let pairs = [(&masked, &plain), (&plain, &self.full), (&masked, &self.full)];
         let left = 100.0 * counts[1] as f64 / counts[0].max(1) as f64;
         let head = [self.window.source.clone(), mesh.to_owned(), tolerance.to_owned()];
         let counts = counts.map(|count| count.to_string()).into_iter().chain([format!("{left:.1}")]);
         let differences =
             pairs.into_iter().flat_map(|(a, b)| Self::difference(a, b).map(|d| format!("{d:.2}")));
-        head.into_iter().chain(counts).chain(differences).collect()
+        head.into_iter().chain(counts).chain(differences).chain(covered).collect()
     }
 
     /// What is seen from a place in the zone, towards the highest ground; and its skyline.
@@ -440,7 +461,7 @@ impl<'a> Sight<'a> {
                 format!("{name}: from the zone; {changed:.2} % of the pixels differ from the full grid");
             let bytes = view::png(&seen).map_err(|e| ExperimentError::Plot(e.to_string()))?;
             pictures.push(Picture { file: format!("{number}-view-{name}.png"), caption, bytes });
-            let skyline = &self.skylines(heights)[middle];
+            let Some(skyline) = &self.skylines(heights)[middle] else { continue };
             let every = (skyline.len() / PLOTTED).max(1);
             let degrees = 360.0 / skyline.len() as f64;
             let points = skyline.iter().enumerate().step_by(every);

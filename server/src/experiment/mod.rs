@@ -201,21 +201,52 @@ pub fn run(
 ) -> Result<Report, ExperimentError> {
     let unknown = || ExperimentError::Unknown { found: name.to_owned() };
     let experiment = ALL.iter().find(|e| e.name == name).ok_or_else(unknown)?;
-    if let Some(bad) = options.tolerances.iter().find(|t| !(0.0..=1e6).contains(*t)) {
-        return Err(ExperimentError::Options {
-            option: "--tolerances",
-            expected: "percentages from 0".to_owned(),
-            found: bad.to_string(),
-        });
-    }
+    check(options)?;
     match experiment.work {
         Work::Windows(run) => {
             let windows =
                 windows::read(sources, ingest, &options.windows, options.mask.as_deref(), progress)?;
-            run(&Run { windows: &windows, options, progress })
+            let mut report = run(&Run { windows: &windows, options, progress })?;
+            let padded = windows.iter().filter(|w| w.field.samples() < w.field.heights().len()).count();
+            if padded > 0 {
+                let all = windows.len();
+                report.notes.push(format!(
+                    "{padded} of {all} windows have samples without data, or reach beyond their DEM, which is the same."
+                ));
+            }
+            Ok(report)
         }
         Work::Whole(run) => run(&Whole { sources, ingest, options, progress }),
     }
+}
+
+/// Refuses options that make no sense for any DEM.
+fn check(options: &Options) -> Result<(), ExperimentError> {
+    let wrong = |option, expected: &str, found: &dyn std::fmt::Display| {
+        let (expected, found) = (expected.to_owned(), found.to_string());
+        Err(ExperimentError::Options { option, expected, found })
+    };
+    if let Some(bad) = options.tolerances.iter().find(|t| !(0.0..=1e6).contains(*t)) {
+        return wrong("--tolerances", "percentages from 0", bad);
+    }
+    if let Some(bad) = options.points.iter().find(|n| **n < 4) {
+        return wrong("--points", "numbers from 4, the corners", bad);
+    }
+    if !(options.eye > 0.0 && options.eye <= 1e6) {
+        return wrong("--eye", "metres above the ground, above 0 and at most a million", &options.eye);
+    }
+    if !(0.0..=1e9).contains(&options.forgiveness) {
+        return wrong("--forgiveness", "a number from 0", &options.forgiveness);
+    }
+    let last = options.windows.samples.saturating_sub(1);
+    if let Some([x, y]) = options.observer.filter(|p| p.iter().any(|w| *w > last)) {
+        return wrong(
+            "--observer",
+            &format!("a sample of the window, 0,0 to {last},{last}"),
+            &format!("{x},{y}"),
+        );
+    }
+    Ok(())
 }
 
 /// The mean of some numbers and their sample standard deviation, 0 for fewer than two.

@@ -4,9 +4,9 @@
 //! neighbour, with one restart reference between two. *Cached* is a list of separate triangles in the recursion's order,
 //! told by the vertices that a first-in first-out cache of 32 has to fetch for it.
 
-use super::report::{Report, Table};
-use super::select::{Ground, Strategy, by_strategy};
-use super::{ExperimentError, Run};
+use super::report::{Picture, Report, Table};
+use super::select::{Ground, scale, select};
+use super::{ExperimentError, Run, mean_and_spread, plot};
 use diamantina_protocol::bintree::Point;
 use diamantina_protocol::bitree::{Bitree, strip};
 use std::collections::{BTreeMap, VecDeque};
@@ -20,6 +20,7 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
         "x",
         "y",
         "tolerance [%]",
+        "strategy",
         "triangles",
         "separate references",
         "line triangles",
@@ -34,49 +35,71 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     let mut table = Table::new("strips", caption, &columns);
     let steps = run.windows.len() * (run.options.tolerances.len() + 1);
     run.progress.stage("ordering", "meshes", steps as u64, 0);
+    // Percent that one strip and several save, by tolerance and window.
+    let mut saved =
+        [vec![Vec::new(); run.options.tolerances.len()], vec![Vec::new(); run.options.tolerances.len()]];
     for window in run.windows {
         let Some(ground) = Ground::new(&window.field, window.weights.as_deref()) else { continue };
-        let mut push = |label: String, tree: &Bitree| {
-            let place = [window.source.clone(), window.at[0].to_string(), window.at[1].to_string(), label];
-            table.push(place.into_iter().chain(row(tree)));
+        let mut push = |label: [String; 2], tree: &Bitree| {
+            let place = [window.source.clone(), window.at[0].to_string(), window.at[1].to_string()];
+            let (cells, saved) = row(tree);
+            table.push(place.into_iter().chain(label).chain(cells));
             run.progress.advance(1);
+            saved
         };
-        push("full".to_owned(), &window.field.full_tree());
-        for percent in &run.options.tolerances {
+        push(["full".to_owned(), String::new()], &window.field.full_tree());
+        for (i, percent) in run.options.tolerances.iter().enumerate() {
             if run.progress.is_stopping() {
                 return Err(ExperimentError::Stopped);
             }
-            let tolerance = percent / 100.0 * window.field.relief();
-            let tree = by_strategy(&ground, run.options.criterion, tolerance, Strategy::Compact);
-            push(percent.to_string(), &tree);
+            let tolerance = percent / 100.0 * scale(&ground, run.options.criterion);
+            let (tree, strategy) = select(&ground, run.options.criterion, tolerance);
+            let both = push([percent.to_string(), strategy.to_string()], &tree);
+            saved.iter_mut().zip(both).for_each(|(saved, one)| saved[i].push(one));
         }
     }
+    let line = |(name, saved): (&str, &Vec<Vec<f64>>)| {
+        let points = run.options.tolerances.iter().zip(saved);
+        let points = points.map(|(percent, saved)| [*percent, mean_and_spread(saved)[0]]).collect();
+        plot::Series { name: name.to_owned(), points }
+    };
+    let series: Vec<plot::Series> =
+        ["one strip", "several strips"].into_iter().zip(&saved).map(line).collect();
+    let axes = ["tolerance [%]", "references saved [%]"];
+    let bytes = plot::lines("Strips beside separate triangles", axes, false, &series)?;
+    let caption = "References that strips save of separate triangles': means of the windows.".to_owned();
     Ok(Report {
         title: "Triangle strips".to_owned(),
-        notes: vec!["Separate triangles take three references each.".to_owned()],
+        notes: vec![
+            "Separate triangles take three references each. The selection is the better of compact and greedy, \
+             by points and then triangles."
+                .to_owned(),
+        ],
         tables: vec![table],
-        pictures: Vec::new(),
+        pictures: vec![Picture { file: "strips.svg".to_owned(), caption, bytes }],
     })
 }
 
-fn row(tree: &Bitree) -> Vec<String> {
+/// The cells of a mesh, and the percent that one strip and several save.
+fn row(tree: &Bitree) -> (Vec<String>, [f64; 2]) {
     let one = strip::strip(tree);
     let triangles = strip::triangles(&one);
     let several = greedy_strips(&triangles);
     let references = several.iter().map(Vec::len).sum::<usize>() + several.len().saturating_sub(1);
     let separate = 3 * triangles.len();
-    let saved = |references: usize| format!("{:.1}", 100.0 * (1.0 - references as f64 / separate as f64));
-    vec![
+    let saved = [one.len(), references].map(|n| 100.0 * (1.0 - n as f64 / separate as f64));
+    let cells = vec![
         triangles.len().to_string(),
         separate.to_string(),
         strip::line_triangles(&one).to_string(),
         one.len().to_string(),
-        saved(one.len()),
+        format!("{:.1}", saved[0]),
         several.len().to_string(),
         references.to_string(),
-        saved(references),
+        format!("{:.1}", saved[1]),
         format!("{:.3}", fetches(&triangles) as f64 / triangles.len() as f64),
-    ]
+    ];
+    (cells, saved)
 }
 
 /// Vertices that a first-in first-out cache has to fetch for triangles in their order.

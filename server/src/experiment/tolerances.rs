@@ -6,7 +6,7 @@
 //! is measured anew, over all samples.
 
 use super::report::{Picture, Report, Table};
-use super::select::{Ground, Strategy, by_number, by_strategy, largest_error};
+use super::select::{Ground, Strategy, by_number, by_strategy, largest_error, scale};
 use super::windows::Window;
 use super::{Criterion, ExperimentError, Run, mean_and_spread, plot, quadtree};
 use diamantina_protocol::bitree::{Bitree, strip};
@@ -21,25 +21,30 @@ struct Counts {
     added: usize,
     triangles: usize,
     references: usize,
-    /// Metres.
+    /// The largest vertical distance to any sample, whatever it weighs: metres.
     error: f64,
+    /// The largest error by the criterion, in its own unit.
+    judged: f64,
 }
 
 /// One bitree with its two baselines.
 #[derive(Debug, Clone, Copy)]
 struct Outcome {
+    /// In the criterion's own unit.
+    tolerance: f64,
     bitree: Counts,
     closed: Counts,
     own: Counts,
 }
 
-fn counts(ground: &Ground<'_>, tree: &Bitree, added: usize) -> Counts {
+fn counts(ground: &Ground<'_>, criterion: Criterion, tree: &Bitree, added: usize) -> Counts {
     Counts {
         transmitted: tree.points().0,
         added,
         triangles: tree.triangle_count(),
         references: strip::strip(tree).len(),
-        error: largest_error(ground, Criterion::Vertical, tree),
+        error: largest_error(&ground.unweighted(), Criterion::Vertical, tree),
+        judged: largest_error(ground, criterion, tree),
     }
 }
 
@@ -51,9 +56,10 @@ fn outcome(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, strategy: 
     let own = quadtree::select(field, tolerance, |facet, enough| criterion.error(ground, facet, enough));
     let (real, fictitious) = bitree.points();
     Outcome {
-        bitree: counts(ground, &bitree, fictitious),
-        closed: counts(ground, &closed, closed.points().0 - real),
-        own: counts(ground, &own, 0),
+        tolerance,
+        bitree: counts(ground, criterion, &bitree, fictitious),
+        closed: counts(ground, criterion, &closed, closed.points().0 - real),
+        own: counts(ground, criterion, &own, 0),
     }
 }
 
@@ -78,7 +84,7 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
             if run.progress.is_stopping() {
                 return Err(ExperimentError::Stopped);
             }
-            let tolerance = percent / 100.0 * window.field.relief();
+            let tolerance = percent / 100.0 * scale(&ground, run.options.criterion);
             for strategy in &strategies {
                 let outcome = outcome(&ground, run.options.criterion, tolerance, *strategy);
                 push_each(&mut each, window, *percent, *strategy, &outcome);
@@ -94,7 +100,8 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     let pictures = vec![savings_plot(run, &found, strategies[0])?];
     let notes = vec![
         format!(
-            "{} windows of {} x {} samples; criterion {:?}; tolerances in percent of each window's relief.",
+            "{} windows of {} x {} samples; criterion {:?}; tolerances in percent of each window's \
+             relief, or, by criteria that are no distances, of the error of the corners' two triangles.",
             run.windows.len(),
             run.options.windows.samples,
             run.options.windows.samples,
@@ -126,7 +133,7 @@ fn best(found: &BTreeMap<(usize, Strategy), Vec<Outcome>>, tolerances: &[f64]) -
     names.collect::<Vec<_>>().join(", ")
 }
 
-const EACH: [&str; 23] = [
+const EACH: [&str; 24] = [
     "DEM",
     "x",
     "y",
@@ -150,6 +157,7 @@ const EACH: [&str; 23] = [
     "BT error [m]",
     "closed QT error [m]",
     "own QT error [m]",
+    "BT error by the criterion",
 ];
 
 fn each_table() -> Table {
@@ -167,6 +175,7 @@ fn push_each(table: &mut Table, window: &Window, percent: f64, strategy: Strateg
     }
     row.extend(all.map(|c| c.references.to_string()));
     row.extend(all.map(|c| format!("{:.3}", c.error)));
+    row.push(format!("{:.3}", o.bitree.judged));
     table.push(row);
 }
 
@@ -194,14 +203,13 @@ fn numbers_table(run: &Run<'_>) -> Result<Table, ExperimentError> {
                 return Err(ExperimentError::Stopped);
             }
             let tree = by_number(&ground, run.options.criterion, *asked);
-            let c = counts(&ground, &tree, tree.points().1);
-            let own = largest_error(&ground, run.options.criterion, &tree);
+            let c = counts(&ground, run.options.criterion, &tree, tree.points().1);
             let mut row = vec![window.source.clone()];
             row.extend(
                 [window.at[0] as usize, window.at[1] as usize, *asked, c.transmitted].map(|n| n.to_string()),
             );
             row.extend([c.added, c.triangles, c.references].map(|n| n.to_string()));
-            row.extend([own, c.error].map(|error| format!("{error:.3}")));
+            row.extend([c.judged, c.error].map(|error| format!("{error:.3}")));
             table.push(row);
             run.progress.advance(1);
         }
@@ -224,7 +232,7 @@ fn means_table(run: &Run<'_>, found: &BTreeMap<(usize, Strategy), Vec<Outcome>>)
         "BT references",
         "closed QT references",
         "own QT references",
-        "largest BT error [% of tolerance]",
+        "largest BT error by the criterion [% of tolerance]",
     ];
     let mut table = Table::new("means", "Means over all windows", &columns);
     for ((i, strategy), list) in found {
@@ -233,10 +241,9 @@ fn means_table(run: &Run<'_>, found: &BTreeMap<(usize, Strategy), Vec<Outcome>>)
             format!("{:.1}", mean_and_spread(&values)[0])
         };
         let percent = run.options.tolerances[*i];
-        let worst = list.iter().zip(run.windows).map(|(o, w)| {
-            let tolerance = percent / 100.0 * w.field.relief();
-            if o.bitree.error == 0.0 { 0.0 } else { 100.0 * o.bitree.error / tolerance }
-        });
+        let worst = list
+            .iter()
+            .map(|o| if o.bitree.judged == 0.0 { 0.0 } else { 100.0 * o.bitree.judged / o.tolerance });
         let mut row = vec![percent.to_string(), strategy.to_string()];
         row.extend([mean(&|o| o.bitree.added), mean(&|o| o.closed.added)]);
         for count in [|c: Counts| c.transmitted, |c: Counts| c.triangles, |c: Counts| c.references] {

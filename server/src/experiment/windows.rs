@@ -95,6 +95,9 @@ pub(super) fn read(
     if !(2..=4096).contains(&cells) || !cells.is_power_of_two() {
         return Err(bad("--samples", "a power of two and one more, 3 to 4097", options.samples.to_string()));
     }
+    if options.at.is_some() && options.windows != Rule::One {
+        return Err(bad("--at", "a place for one window", "--windows that says which".to_owned()));
+    }
     if mask.is_some() && sources.len() != 1 {
         return Err(bad("--mask", "one DEM, whose grid the mask has", format!("{} DEMs", sources.len())));
     }
@@ -102,6 +105,11 @@ pub(super) fn read(
     let mut windows = Vec::new();
     for path in sources {
         let source = ingest::open(std::slice::from_ref(path), ingest)?;
+        let (name, grid) = (file_name(path), source.grid());
+        if let Some([x, y]) = options.at.filter(|[x, y]| *x >= grid.width || *y >= grid.height) {
+            let expected = format!("a sample of {name}, up to {},{}", grid.width - 1, grid.height - 1);
+            return Err(bad("--at", &expected, format!("{x},{y}")));
+        }
         let mask = mask.map(|m| open_mask(m, ingest, &source)).transpose()?;
         let places = places(&source, options, cells);
         progress.stage("reading windows", "windows", places.len() as u64, 0);
@@ -114,17 +122,23 @@ pub(super) fn read(
                 continue;
             };
             let weights = mask.as_ref().map(|m| weights(m, at, log2)).transpose()?;
-            let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-            let grid = source.grid();
             let origin = [0, 1].map(|k| grid.origin[k] + f64::from(at[k]) * grid.cell[k]);
-            windows.push(Window { source: name, at, origin, crs: grid.frame_crs(), field, weights });
+            windows.push(Window { source: name.clone(), at, origin, crs: grid.frame_crs(), field, weights });
         }
         source.check_nodata()?;
     }
     if windows.is_empty() {
-        return Err(bad("--windows", "at least one window that fits the rule", "none".to_owned()));
+        let names = sources.iter().map(|path| file_name(path)).collect::<Vec<_>>().join(", ");
+        return Err(match options.windows {
+            Rule::One => bad("--at", "a window with data in it", format!("none there in {names}")),
+            _ => bad("--windows", "at least one window that fits the rule", format!("none in {names}")),
+        });
     }
     Ok(windows)
+}
+
+fn file_name(path: &Path) -> String {
+    path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
 }
 
 fn places(source: &Source, options: &Options, cells: u32) -> Vec<Point> {

@@ -390,6 +390,9 @@ struct Sky<'a> {
     windows: Vec<[f64; 2]>,
     /// The highest slope of all windows.
     ajar: f64,
+    /// Whether something without height was passed since the last segment: only there may a window open. A surface
+    /// without holes goes on where it was, whatever rounding says.
+    after_hole: bool,
     /// Kept to be filled again.
     spare: Vec<[f64; 2]>,
     optics: &'a Optics,
@@ -417,6 +420,7 @@ impl<'a> Sky<'a> {
             threshold: horizon,
             windows: Vec::new(),
             ajar: horizon,
+            after_hole: true,
             spare: Vec::new(),
             optics,
             least,
@@ -483,9 +487,10 @@ impl<'a> Sky<'a> {
             }
             self.spare = before;
         }
-        if is_above(hi, self.horizon) && is_above(lo, self.horizon) {
+        if self.after_hole && is_above(lo, self.horizon) {
             self.windows.push([self.horizon, lo]);
         }
+        self.after_hole = false;
         if hi > self.horizon {
             self.horizon = hi;
             self.threshold = threshold(hi);
@@ -554,8 +559,10 @@ impl<W: Witness> Walk<'_, W> {
         let blocks = posts.map(|post| plane.sample([block, row(post)]));
         let [low, high] = plane.relief.bounds(which, blocks);
         if low > high {
+            self.sky.after_hole = true;
             return true;
         }
+        let has_holes = plane.relief.has_holes(which, blocks);
         let slopes = [lowest_slope(f64::from(low), posts), highest_slope(f64::from(high), posts)];
         if self.sky.shows(slopes) {
             return false;
@@ -566,12 +573,17 @@ impl<W: Witness> Walk<'_, W> {
                 return false;
             }
             if share > BLOCK_SHARE_MAX {
-                return blocks.iter().all(|block| self.witness.knows_block(*block, share));
+                let is_known = blocks.iter().all(|block| self.witness.knows_block(*block, share));
+                if is_known {
+                    self.sky.after_hole = has_holes;
+                }
+                return is_known;
             }
             for block in blocks {
                 self.witness.note(Seen { region: Region::Block(block), slopes, share });
             }
         }
+        self.sky.after_hole = has_holes;
         true
     }
 
@@ -616,7 +628,10 @@ impl<W: Witness> Walk<'_, W> {
         let [a, b, c, d] = heights;
         let high = a.max(b).max(c.max(d));
         let mut low = a.min(b).min(c.min(d));
-        if low == NODATA {
+        let has_hole = low == NODATA;
+        if has_hole {
+            // Where the cell is hidden, its triangles are not looked at one by one.
+            self.sky.after_hole = true;
             if high == NODATA {
                 return;
             }
@@ -625,6 +640,7 @@ impl<W: Witness> Walk<'_, W> {
         let posts = [from, to];
         let slopes = [lowest_slope(f64::from(low), posts), highest_slope(f64::from(high), posts)];
         if !self.sky.shows(slopes) {
+            self.sky.after_hole = has_hole;
             if self.witness.knows_seen(places) {
                 return;
             }
@@ -660,6 +676,7 @@ impl<W: Witness> Walk<'_, W> {
                 (false, false) => ([1, 2, 3], [h1 + h3 - h2, h2 - h3, h2 - h1]),
             };
             if [i, c, l].iter().any(|corner| heights[*corner] == NODATA) {
+                self.sky.after_hole = true;
                 continue;
             }
             let ends = [from, to].map(|post| {
@@ -671,6 +688,7 @@ impl<W: Witness> Walk<'_, W> {
                 self.sky.cover(slopes);
                 1.0
             } else {
+                self.sky.after_hole = false;
                 self.sky.share(slopes)
             };
             if share > self.sky.least {

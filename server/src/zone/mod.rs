@@ -59,7 +59,7 @@ pub const EYES: f64 = 200.0;
 const EYES_MAX: usize = 1 << 16;
 
 /// Bytes of memory for a sample: its height, its share of the blocks, its visibility.
-const SAMPLE_BYTES: f64 = 5.7;
+const SAMPLE_BYTES: f64 = 5.8;
 
 /// Bytes of memory for a diamond while its layer is read: an entry of the index.
 const DIAMOND_BYTES: u64 = 50;

@@ -13,7 +13,7 @@ pub const BLOCKS_LOG2: [u32; 3] = [2, 4, 6];
 
 /// Heights in quanta, with a pyramid of blocks.
 ///
-/// Takes 4 bytes a sample and 8/15 of a byte for the blocks.
+/// Takes 4 bytes a sample and 3/5 of a byte for the blocks.
 #[derive(Debug)]
 pub struct Relief {
     heights: Tiled<i32>,
@@ -25,6 +25,8 @@ pub struct Relief {
 struct Blocks {
     size: [usize; 2],
     bounds: Vec<[i32; 2]>,
+    /// Whether some sample has no height.
+    holes: Vec<bool>,
 }
 
 /// What a block without any height has: it lies below everything.
@@ -127,6 +129,13 @@ impl Relief {
         drawn.then(|| corners.iter().map(|(height, weight)| f64::from(*height) * weight).sum())
     }
 
+    /// Whether some sample of two neighbouring blocks or one has no height.
+    #[must_use]
+    pub(super) fn has_holes(&self, which: usize, places: [[usize; 2]; 2]) -> bool {
+        let blocks = &self.blocks[which];
+        places.iter().any(|[x, y]| blocks.holes[y * blocks.size[0] + x])
+    }
+
     /// The lowest and highest sample of two neighbouring blocks or one; blocks number `which` of
     /// [`BLOCKS_LOG2`]. None has a height where low > high.
     #[must_use]
@@ -149,32 +158,36 @@ impl Blocks {
         let items = heights.items();
         let bound = |i: usize| {
             let [x, y] = [i % size[0] * side, i / size[0] * side];
-            let mut bounds = NOTHING;
+            let (mut bounds, mut has_holes) = (NOTHING, false);
             for y in y..=(y + side).min(height - 1) {
                 let row = heights.offset(1, y);
                 for x in x..=(x + side).min(width - 1) {
                     let height = items[row + heights.offset(0, x)];
-                    if height != NODATA {
+                    if height == NODATA {
+                        has_holes = true;
+                    } else {
                         bounds = merged(bounds, [height, height]);
                     }
                 }
             }
-            bounds
+            (bounds, has_holes)
         };
-        let bounds = (0..size[0] * size[1]).into_par_iter().map(bound).collect();
-        Self { size, bounds }
+        let (bounds, holes) = (0..size[0] * size[1]).into_par_iter().map(bound).unzip();
+        Self { size, bounds, holes }
     }
 
     /// Blocks with sides larger by a power of two.
     fn coarser(&self, log2: u32) -> Self {
         let size = self.size.map(|blocks| blocks.div_ceil(1 << log2));
         let mut bounds = vec![NOTHING; size[0] * size[1]];
-        for (i, bound) in self.bounds.iter().enumerate() {
+        let mut holes = vec![false; bounds.len()];
+        for (i, (bound, has_holes)) in self.bounds.iter().zip(&self.holes).enumerate() {
             let [x, y] = [i % self.size[0], i / self.size[0]].map(|w| w >> log2);
-            let whole = &mut bounds[y * size[0] + x];
-            *whole = merged(*whole, *bound);
+            let whole = y * size[0] + x;
+            bounds[whole] = merged(bounds[whole], *bound);
+            holes[whole] |= has_holes;
         }
-        Self { size, bounds }
+        Self { size, bounds, holes }
     }
 }
 
@@ -195,6 +208,7 @@ mod tests {
                     let block = [x >> log2, y >> log2];
                     let [low, high] = relief.bounds(which, [block, block]);
                     let corners = [[x, y], [x + 1, y], [x, y + 1], [x + 1, y + 1]].map(|c| relief.at(c));
+                    assert!(!corners.contains(&NODATA) || relief.has_holes(which, [block, block]));
                     assert!(corners.iter().all(|h| *h == NODATA || (low..=high).contains(h)));
                 }
             }

@@ -32,6 +32,12 @@ impl<'a> Ground<'a> {
         self.field
     }
 
+    /// The same field with all samples counting fully.
+    #[must_use]
+    pub fn unweighted(&self) -> Ground<'a> {
+        Self { field: self.field, weights: None, curvatures: OnceLock::new(), full: OnceLock::new() }
+    }
+
     fn weight(&self, slot: usize) -> f64 {
         self.weights.map_or(1.0, |w| f64::from(w[slot]))
     }

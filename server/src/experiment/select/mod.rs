@@ -95,6 +95,15 @@ pub fn by_number(ground: &Ground<'_>, criterion: Criterion, points: usize) -> Bi
     greedy(ground, criterion, 0.0, GREEDY_SHARE, points, ground.field().tree())
 }
 
+/// What 100 % of a tolerance is by a criterion: of distances the relief, else the error of the corners' two triangles.
+#[must_use]
+pub fn scale(ground: &Ground<'_>, criterion: Criterion) -> f64 {
+    match criterion {
+        Criterion::Vertical | Criterion::Euclidean | Criterion::Coefficient => ground.field().relief(),
+        Criterion::Curvature | Criterion::Normal => largest_error(ground, criterion, &ground.field().tree()),
+    }
+}
+
 /// The largest error by a criterion over the triangles that are drawn.
 #[must_use]
 pub fn largest_error(ground: &Ground<'_>, criterion: Criterion, tree: &Bitree) -> f64 {

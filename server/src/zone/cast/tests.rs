@@ -315,3 +315,25 @@ fn the_step_of_azimuth_is_half_the_least_triangle_that_counts() {
     let mask = cast(&relief, &fine, &[eye], &Progress::hidden()).unwrap();
     assert!(mask.rows().all(|v| v == 255), "all of a plain is seen from above");
 }
+
+/// A ground without holes leaves nothing open below the horizon, however fine the quantum.
+#[test]
+fn rounding_opens_no_windows_in_a_surface_without_holes() {
+    let side = 120usize;
+    let height = |i: usize| {
+        let (x, y) = ((i % side) as f64, (i / side) as f64);
+        let noise = f64::from((i as u32).wrapping_mul(0x9E37_79B1) >> 20);
+        ((1500.0 + 1400.0 * (x / 9.0).sin() * (y / 13.0).cos()) * 1000.0 + 90.0 * noise) as i32
+    };
+    let relief = Relief::from_rows([side, side], &(0..side * side).map(height).collect::<Vec<i32>>());
+    let optics =
+        Optics { cell: [77.0, 93.0], quantum: 1e-3, bend: 0.0, epsilon: 0.0, hidden: 0.0, angle: 0.0 };
+    let place = [60.3, 58.9];
+    let eye = Eye { place, height: relief.height(place).unwrap() + 3000.0 };
+    for i in 0..20_000 {
+        let plane = Plane::new(&relief, &optics, eye, f64::from(i) / 20_000.0 * TAU + 1e-4);
+        let mut walk = Walk { plane, sky: Sky::new(&optics), witness: |_: Seen| {} };
+        walk.run();
+        assert!(walk.sky.windows.is_empty(), "azimuth {i}: {:?}", walk.sky.windows);
+    }
+}
