@@ -2,7 +2,7 @@
 //! the ground is that of the points.
 
 use crate::stream::{fly_over_magenta, over_magenta, sharp};
-use crate::world::{Faults, Proxy, World, build, data, options, serve};
+use crate::world::{Faults, Proxy, World, build, data, options, programs, serve};
 use diamantina_client::camera::{Camera, FOV_Y};
 use diamantina_client::drawing::DrawItem;
 use diamantina_client::encoding::Encoding;
@@ -15,6 +15,7 @@ use diamantina_server::hierarchy::{self, TinOptions};
 use diamantina_server::ingest;
 use glam::DVec3;
 use std::collections::{HashMap, HashSet};
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 const MINUTE: Duration = Duration::from_secs(60);
@@ -204,4 +205,25 @@ fn both_encodings_of_a_real_dem_show_the_same_ground() {
         assert!(worst <= 3, "skylines differ by {worst} pixels");
         assert!(mean < 8.0, "colours differ by {mean}");
     }
+}
+
+#[test]
+fn what_triangles_cannot_do_is_refused_with_the_remedy() {
+    let world = World::sample(129, 0.0);
+    let client = |arguments: &[&str]| {
+        let mut command = Command::new(&programs().client);
+        command.args(arguments).args(["--encoding", "tin", "--size", "64x64"]);
+        let output = command.current_dir(world.folder.path()).output().unwrap();
+        (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    let scene = world.served.scene("world");
+    let (code, text) = client(&["render", &scene, "-o", "a.png"]);
+    assert!(
+        code == Some(1) && text.contains("offered as points, asked for as tin: build the store"),
+        "{text}"
+    );
+    let (code, text) = client(&["render", &scene, "-o", "a.png", "--stream"]);
+    assert!(code == Some(2) && text.contains("leave --stream or --encoding tin out"), "{text}");
+    let (code, text) = client(&["fly", &scene, "--morph", "1"]);
+    assert!(code == Some(2) && text.contains("leave --morph or --encoding tin out"), "{text}");
 }
