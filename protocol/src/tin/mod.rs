@@ -231,7 +231,8 @@ pub fn encode(forest: &Forest, d: Diamond, patch: &Patch) -> Result<Vec<u8>, Pat
 /// The patch of a diamond. The bytes may be hostile: whatever is returned has no more than [`TRIANGLES_MAX`]
 /// triangles, each turning left within its child triangle, no two on the same side of an edge, and heights in range.
 ///
-/// Takes 8 MB beside the patch at most, and time in proportion to the triangles.
+/// Takes 12 MB beside the patch at most, most of it for gates (24 bytes each, two a triangle and two a part, and what a list
+/// takes that has just grown), and time in proportion to the triangles.
 ///
 /// # Errors
 /// When the bytes are no payload of this format.
