@@ -35,6 +35,10 @@ mod stream;
 mod swap;
 /// The house: who may import whom, how long a file may be.
 mod tidy;
+/// Laws 2, 3, 6 and 7 for triangles: borders fit, declared errors hold, killed builds go on, and are served.
+mod tin;
+/// Triangles as the client draws them: no cracks, no seams of light, the same ground as points.
+mod triangles;
 /// Law 3: declared errors hold at every sample of real DEMs.
 mod truth;
 /// The harness: synthetic DEM → store → server on a free port → client, and a network that misbehaves.

@@ -2,6 +2,7 @@
 
 use crate::world::{Faults, Proxy, World, build, data, options, programs, serve};
 use diamantina_client::camera::{Camera, FOV_Y};
+use diamantina_client::encoding::Encoding;
 use diamantina_client::headless::{self, Flight, FlightPath, PathKey};
 use diamantina_client::render::{self, Background, Look};
 use diamantina_client::terrain::{self, Terrain};
@@ -16,11 +17,11 @@ use std::time::Duration;
 const MAGENTA: [u8; 4] = [255, 0, 255, 255];
 
 /// One sample a pixel, so that a gap between triangles shows as magenta, not as a tint.
-fn sharp() -> render::Options {
+pub(crate) fn sharp() -> render::Options {
     render::Options { samples: 1, ..render::Options::default() }
 }
 
-fn over_magenta() -> Look {
+pub(crate) fn over_magenta() -> Look {
     Look { background: Background::Colour([1.0, 0.0, 1.0, 1.0]), ..Look::default() }
 }
 
@@ -134,9 +135,14 @@ fn steep_flight(scene: &diamantina_protocol::message::Scene) -> FlightPath {
 /// Flies 300 frames through a network and looks at each pixel of each.
 ///
 /// How many frames lacked data, and the sorted milliseconds of their cuts.
-fn fly_over_magenta(world: &World, faults: Faults, seed: u64) -> (usize, Vec<f64>) {
+pub(crate) fn fly_over_magenta(
+    world: &World,
+    faults: Faults,
+    seed: u64,
+    encoding: Encoding,
+) -> (usize, Vec<f64>) {
     let proxy = Proxy::start(&world.served.address, faults, seed);
-    let fetch = diamantina_client::fetch::Options::default();
+    let fetch = diamantina_client::fetch::Options { encoding, ..Default::default() };
     let options = terrain::Options { tolerance_pixels: 0.2, fetch, ..terrain::Options::default() };
     let mut terrain = Terrain::open(&format!("{}/scenes/world", proxy.address), options).unwrap();
     let path = steep_flight(terrain.scene());
@@ -166,7 +172,7 @@ fn fly_over_magenta(world: &World, faults: Faults, seed: u64) -> (usize, Vec<f64
 fn over_magenta_no_pixel_is_magenta_while_data_come_late_and_out_of_order() {
     let world = World::whole(1025);
     let faults = Faults { delay: Duration::from_millis(250), cut: 0.95, ..Faults::default() };
-    let (unfinished, _) = fly_over_magenta(&world, faults, 1);
+    let (unfinished, _) = fly_over_magenta(&world, faults, 1, Encoding::Points);
     assert!(unfinished > 30, "the network was too fast: {unfinished} unfinished frames");
 }
 
@@ -187,7 +193,7 @@ fn a_hole_would_be_seen() {
 fn a_frame_waits_for_nothing_while_the_network_hangs() {
     let world = World::whole(1025);
     let faults = Faults { stalled: 1.0, stall: Duration::from_secs(30), ..Faults::default() };
-    let (unfinished, cuts) = fly_over_magenta(&world, faults, 2);
+    let (unfinished, cuts) = fly_over_magenta(&world, faults, 2, Encoding::Points);
     assert!(unfinished > 30, "nothing hung: {unfinished} unfinished frames");
     // Far below the 30 s of the network, far above a cut's own time: a busy machine may pause any thread.
     let (common, slowest) = (cuts[cuts.len() * 95 / 100], cuts[cuts.len() - 1]);

@@ -206,6 +206,18 @@ impl World {
         Self::of(folder, &dem, &ingest, &options())
     }
 
+    /// As [`World::whole`], with triangles, too.
+    pub(crate) fn whole_with_triangles(samples: u32) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let dem = folder.path().join("dem.raw");
+        let last = f64::from(samples - 1);
+        let ingest = write_raw(&dem, [samples; 2], |x, y| {
+            Some(sample::height(f64::from(x) / last, f64::from(y) / last).unwrap_or(0.0))
+        });
+        let options = hierarchy::Options { tin: Some(hierarchy::TinOptions::default()), ..options() };
+        Self::of(folder, &dem, &ingest, &options)
+    }
+
     fn of(folder: TempDir, dem: &Path, ingest: &ingest::Options, options: &hierarchy::Options) -> Self {
         let store = folder.path().join("store");
         let report = build(dem, &store, ingest, options);

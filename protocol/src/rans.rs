@@ -227,6 +227,19 @@ impl<'a> Decoder<'a> {
         self.states
     }
 
+    /// One lane's state, where others are not needed: reading all after one has been written waits for the writing.
+    #[inline(always)]
+    #[must_use]
+    pub fn state(&self, lane: usize) -> u32 {
+        self.states[lane]
+    }
+
+    /// Gives one lane's state back.
+    #[inline(always)]
+    pub fn set_state(&mut self, lane: usize, state: u32) {
+        self.states[lane] = state;
+    }
+
     /// Gives the states back.
     pub fn set_states(&mut self, states: [u32; 2]) {
         self.states = states;

@@ -4,7 +4,7 @@
 //! of a patch meet in a point alone, becomes one vertex a fan: then each has at most one gap around it, and
 //! a front can be followed without choices.
 
-use super::walk::{Beyond, NONE, Point, Square};
+use super::walk::{Beyond, NONE, Point, Seed, Square, Within, cross};
 use super::{Patch, PatchError, TRIANGLES_MAX};
 
 /// A triangle's corner: three times its number, and 0 to 2.
@@ -18,42 +18,22 @@ fn prev(corner: Corner) -> Corner {
     next(next(corner))
 }
 
-/// A mesh to be sent.
+/// A mesh to be sent. Gates are marked with the corner of the triangle beyond where the gate starts, or [`NONE`].
 pub(super) struct Mesh {
     /// The fan of each corner.
     fans: Vec<u32>,
-    /// Across the edge from a corner to the next one: the corner where the edge ends, or [`NONE`].
-    opposite: Vec<Corner>,
-    /// The corners of each fan, and where the list of each begins.
-    corners: Vec<Corner>,
-    starts: Vec<u32>,
+    /// Across the edge from a corner to the next one: the corner where the neighbour's edge starts, or [`NONE`].
+    across: Vec<Corner>,
     /// The place of each fan.
     points: Vec<Point>,
-    /// The walk's name of each fan, [`NONE`] before it is met, and back.
+    /// The walk's name of each fan, [`NONE`] before it is met, and how many have been.
     names: Vec<u32>,
-    fan_of: Vec<u32>,
+    named: u32,
     /// Triangles that the walk has met, and before which there are none left to begin with.
     met: Vec<bool>,
     first: usize,
-}
-
-/// The items' positions in an order by key, and where each key begins. Keys are below `keys`.
-fn grouped(keys: usize, of: &[u32]) -> (Vec<u32>, Vec<u32>) {
-    let mut starts = vec![0u32; keys + 1];
-    for key in of {
-        starts[*key as usize + 1] += 1;
-    }
-    for i in 0..keys {
-        starts[i + 1] += starts[i];
-    }
-    let mut at = starts.clone();
-    let mut list = vec![0u32; of.len()];
-    for (i, key) in (0..).zip(of) {
-        let slot = &mut at[*key as usize];
-        list[*slot as usize] = i;
-        *slot += 1;
-    }
-    (list, starts)
+    /// Whether some edge without a neighbour lies strictly within the square.
+    holes: bool,
 }
 
 impl Mesh {
@@ -62,113 +42,133 @@ impl Mesh {
         if patch.triangles.len() > TRIANGLES_MAX {
             return Err(PatchError::Triangles(patch.triangles.len()));
         }
-        check(patch, points, square)?;
+        let within: Vec<Within> =
+            points.iter().map(|p| square.within(i64::from(p.x), i64::from(p.y))).collect();
+        check(patch, points, &within)?;
         let vertices: Vec<u32> = patch.triangles.iter().flatten().copied().collect();
-        let (corners, starts) = grouped(points.len(), &vertices);
-        let around = |v: u32| &corners[starts[v as usize] as usize..starts[v as usize + 1] as usize];
-        let mut opposite = vec![NONE; vertices.len()];
-        for corner in 0..index(vertices.len()) {
-            let (a, b) = (vertices[corner as usize], vertices[next(corner) as usize]);
-            let twice = around(a).iter().filter(|c| vertices[next(**c) as usize] == b).count();
-            if twice > 1 {
-                return Err(PatchError::Edge(a, b));
-            }
-            let across = around(b).iter().find(|c| vertices[next(**c) as usize] == a);
-            opposite[corner as usize] = across.map_or(NONE, |c| next(*c));
-        }
-        let (fans, places) = fans(&vertices, &opposite, points);
-        let (corners, starts) = grouped(places.len(), &fans);
+        let across = across(&vertices, points.len())?;
+        let (fans, places) = fans(&vertices, &across, points);
+        let outer = |corner: Corner| within[vertices[corner as usize] as usize].outer;
+        let is_inner = |corner: Corner| outer(corner) & outer(next(corner)) == 0;
+        let holes = (0..index(across.len())).any(|c| across[c as usize] == NONE && is_inner(c));
         Ok(Self {
-            opposite,
-            corners,
-            starts,
+            across,
             names: vec![NONE; places.len()],
+            named: 0,
             points: places,
             fans,
-            fan_of: Vec::new(),
             met: vec![false; patch.triangles.len()],
             first: 0,
+            holes,
         })
     }
 
     /// Whether some edge without a neighbour lies strictly within the square.
-    pub(super) fn has_holes(&self, square: &Square) -> bool {
-        (0..index(self.fans.len())).any(|corner| {
-            let outer = |corner: Corner| {
-                let p = self.points[self.fans[corner as usize] as usize];
-                square.within(p.x, p.y).outer
-            };
-            self.opposite[corner as usize] == NONE && outer(corner) & outer(next(corner)) == 0
-        })
+    pub(super) fn has_holes(&self) -> bool {
+        self.holes
     }
 
     /// The first two vertices of the first triangle that has not been met.
-    pub(super) fn seed(&mut self) -> Option<[Point; 2]> {
+    pub(super) fn seed(&mut self) -> Option<Seed> {
         while *self.met.get(self.first)? {
             self.first += 1;
         }
         let corner = index(3 * self.first);
-        Some([corner, corner + 1].map(|corner| {
-            let fan = self.fans[corner as usize];
-            self.meet(fan);
-            self.points[fan as usize]
-        }))
+        let points = [corner, corner + 1].map(|corner| {
+            let fan = self.fans[corner as usize] as usize;
+            self.names[fan] = self.named;
+            self.named += 1;
+            self.points[fan]
+        });
+        Some(Seed { points, marks: [corner, self.across[corner as usize]] })
     }
 
-    fn meet(&mut self, fan: u32) {
-        self.names[fan as usize] = index(self.fan_of.len());
-        self.fan_of.push(fan);
-    }
-
-    /// What lies to the left of the edge between two vertices that the walk has met.
-    pub(super) fn beyond(&mut self, a: u32, b: u32) -> Beyond {
-        let [a, b] = [a, b].map(|name| self.fan_of[name as usize]);
-        let corners = &self.corners[self.starts[a as usize] as usize..self.starts[a as usize + 1] as usize];
-        let Some(corner) = corners.iter().copied().find(|c| self.fans[next(*c) as usize] == b) else {
+    /// What lies beyond a gate.
+    pub(super) fn beyond(&mut self, mark: u32) -> Beyond {
+        if mark == NONE {
             return Beyond::Nothing;
-        };
-        self.met[corner as usize / 3] = true;
-        let fan = self.fans[prev(corner) as usize];
-        match self.names[fan as usize] {
+        }
+        self.met[mark as usize / 3] = true;
+        let fan = self.fans[prev(mark) as usize] as usize;
+        match self.names[fan] {
             NONE => {
-                self.meet(fan);
-                Beyond::New(self.points[fan as usize])
+                self.names[fan] = self.named;
+                self.named += 1;
+                Beyond::New(self.points[fan])
             }
             name => Beyond::Known(name),
         }
     }
+
+    /// The marks of the two gates that the triangle beyond a gate makes.
+    pub(super) fn marks(&self, mark: u32) -> [u32; 2] {
+        [prev(mark), next(mark)].map(|corner| self.across[corner as usize])
+    }
+}
+
+/// For each corner the one across the edge to the next corner, where the neighbour's edge starts.
+fn across(vertices: &[u32], count: usize) -> Result<Vec<Corner>, PatchError> {
+    // The corners of each vertex, with where their edges end.
+    let mut starts = vec![0u32; count + 1];
+    for v in vertices {
+        starts[*v as usize + 1] += 1;
+    }
+    for i in 0..count {
+        starts[i + 1] += starts[i];
+    }
+    let mut at = starts.clone();
+    let mut edges = vec![(0, 0); vertices.len()];
+    for (corner, v) in (0..).zip(vertices) {
+        let slot = &mut at[*v as usize];
+        edges[*slot as usize] = (vertices[next(corner) as usize], corner);
+        *slot += 1;
+    }
+    let edges_of = |v: u32| &edges[starts[v as usize] as usize..starts[v as usize + 1] as usize];
+    let mut across = vec![NONE; vertices.len()];
+    for (a, list) in (0..index(count)).map(|a| (a, edges_of(a))) {
+        for (i, (b, corner)) in list.iter().enumerate() {
+            if list[..i].iter().any(|(other, _)| other == b) {
+                return Err(PatchError::Edge(a, *b));
+            }
+            if *b > a
+                && let Some((_, twin)) = edges_of(*b).iter().find(|(end, _)| *end == a)
+            {
+                across[*corner as usize] = *twin;
+                across[*twin as usize] = *corner;
+            }
+        }
+    }
+    Ok(across)
 }
 
 /// Whether a patch is one.
-fn check(patch: &Patch, points: &[Point], square: &Square) -> Result<(), PatchError> {
+fn check(patch: &Patch, points: &[Point], within: &[Within]) -> Result<(), PatchError> {
     let total = patch.triangles.len();
     if !patch.ends.is_sorted() || patch.ends[3] as usize != total {
         return Err(PatchError::Ends(patch.ends));
     }
-    let mut from = 0;
-    for (child, to) in patch.ends.iter().enumerate() {
-        for triangle in &patch.triangles[from..*to as usize] {
+    for child in 0..4 {
+        for triangle in &patch.triangles[patch.range(child)] {
             if triangle.iter().any(|v| *v as usize >= points.len()) {
                 return Err(PatchError::Vertex(*triangle));
             }
-            let corners = triangle.map(|v| points[v as usize]);
-            let [a, b, c] = corners;
-            if (b.x - a.x) * (c.y - a.y) <= (b.y - a.y) * (c.x - a.x) {
+            let [a, b, c] = triangle.map(|v| points[v as usize]);
+            if cross(a, b, c) <= 0 {
                 return Err(PatchError::Turn(*triangle));
             }
-            if corners.iter().any(|p| square.within(p.x, p.y).children & 1 << child == 0) {
+            let inside = triangle.map(|v| within[v as usize].children);
+            if inside[0] & inside[1] & inside[2] & 1 << child == 0 {
                 return Err(PatchError::Child(*triangle, child));
             }
         }
-        from = *to as usize;
     }
     Ok(())
 }
 
 /// The fan of each corner, and the place of each fan.
-fn fans(vertices: &[u32], opposite: &[Corner], points: &[Point]) -> (Vec<u32>, Vec<Point>) {
+fn fans(vertices: &[u32], across: &[Corner], points: &[Point]) -> (Vec<u32>, Vec<Point>) {
     let mut fans = vec![NONE; vertices.len()];
-    let mut places = Vec::new();
+    let mut places = Vec::with_capacity(points.len());
     for corner in 0..index(vertices.len()) {
         if fans[corner as usize] != NONE {
             continue;
@@ -179,22 +179,22 @@ fn fans(vertices: &[u32], opposite: &[Corner], points: &[Point]) -> (Vec<u32>, V
         let mut at = corner;
         while at != NONE && fans[at as usize] == NONE {
             fans[at as usize] = fan;
-            at = opposite_start(opposite, prev(at));
+            at = across[prev(at) as usize];
         }
-        at = opposite[corner as usize];
+        at = right_of(across, corner);
         while at != NONE && fans[at as usize] == NONE {
             fans[at as usize] = fan;
-            at = opposite[at as usize];
+            at = right_of(across, at);
         }
     }
     (fans, places)
 }
 
-/// Across the edge from a corner to the next one: the corner where the neighbour's edge starts.
-fn opposite_start(opposite: &[Corner], corner: Corner) -> Corner {
-    match opposite[corner as usize] {
+/// The corner to the right around the same vertex.
+fn right_of(across: &[Corner], corner: Corner) -> Corner {
+    match across[corner as usize] {
         NONE => NONE,
-        end => prev(end),
+        end => next(end),
     }
 }
 

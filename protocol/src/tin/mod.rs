@@ -32,8 +32,8 @@ use crate::bintree::Forest;
 use crate::diamond::Diamond;
 use crate::rans::{Context, Decoder, Encoder};
 use mesh::Mesh;
-use numbers::Scale;
-use walk::{Beyond, Fault, Pass, Point, Square, Walk};
+use numbers::{Scale, Tables};
+use walk::{Beyond, Fault, Pass, Point, Seed, Square, Walk};
 
 /// The format that this build writes, and the only one that it reads.
 pub const FORMAT: u8 = 1;
@@ -204,17 +204,22 @@ pub fn encode(forest: &Forest, d: Diamond, patch: &Patch) -> Result<Vec<u8>, Pat
     let points: Vec<Point> = patch
         .vertices
         .iter()
-        .map(|v| Point {
-            x: (i64::from(v.x) - i64::from(centre[0])) >> units.shift,
-            y: (i64::from(v.y) - i64::from(centre[1])) >> units.shift,
-            height: (i64::from(v.height) - base) / step,
+        .map(|v| {
+            // Vertices that no triangle uses may lie anywhere, and then they are not told.
+            let narrow = |value: i64| i32::try_from(value).unwrap_or(i32::MAX);
+            Point {
+                x: narrow((i64::from(v.x) - i64::from(centre[0])) >> units.shift),
+                y: narrow((i64::from(v.y) - i64::from(centre[1])) >> units.shift),
+                height: narrow((i64::from(v.height) - base) / step),
+            }
         })
         .collect();
     let square = Square::new(forest, d, units.shift);
     let mesh = Mesh::new(patch, &points, &square)?;
-    let holes = mesh.has_holes(&square);
-    let mut sender = Sender { coder: Encoder::default(), mesh };
-    let passed = units.pass(&mut sender).and_then(|_| Walk::new(square, holes).run(&mut sender));
+    let holes = mesh.has_holes();
+    let mut sender = Sender { coder: Encoder::default(), tables: numbers::tables(), mesh };
+    let expected = patch.triangles.len();
+    let passed = units.pass(&mut sender).and_then(|_| Walk::new(square, holes, expected).run(&mut sender));
     passed.map_err(|fault| if fault == Fault::Size { PatchError::Vertices } else { PatchError::Overlap })?;
     let two_lanes = patch.triangles.len() >= TWO_LANES_TRIANGLES;
     let flags = if holes { HOLES } else { 0 } | if two_lanes { TWO_LANES } else { 0 };
@@ -226,7 +231,8 @@ pub fn encode(forest: &Forest, d: Diamond, patch: &Patch) -> Result<Vec<u8>, Pat
 /// The patch of a diamond. The bytes may be hostile: whatever is returned has no more than [`TRIANGLES_MAX`]
 /// triangles, each turning left within its child triangle, no two on the same side of an edge, and heights in range.
 ///
-/// Takes 8 MB beside the patch at most, and time in proportion to the triangles.
+/// Takes 12 MB beside the patch at most, most of it for gates (24 bytes each, two a triangle and two a part, and what a list
+/// takes that has just grown), and time in proportion to the triangles.
 ///
 /// # Errors
 /// When the bytes are no payload of this format.
@@ -241,19 +247,35 @@ pub fn decode(forest: &Forest, d: Diamond, bytes: &[u8]) -> Result<Patch, Decode
     }
     let lanes = if flags & TWO_LANES == 0 { 1 } else { 2 };
     let coder = Decoder::new(symbols, lanes).ok_or(DecodeError::Symbols)?;
-    let mut receiver = Receiver { coder, lane: lanes - 1 };
+    let found = if lanes == 1 {
+        receive(forest, d, Receiver::<0> { coder, tables: numbers::tables() }, flags, bytes.len())
+    } else {
+        receive(forest, d, Receiver::<1> { coder, tables: numbers::tables() }, flags, bytes.len())
+    };
+    let (walk, units) = found?;
+    if (walk.triangles().len() >= TWO_LANES_TRIANGLES) != (lanes == 2) {
+        return Err(DecodeError::Symbols);
+    }
+    gather(&walk, units, d)
+}
+
+/// Walks over a mesh as it comes in; numbers are in the lane.
+fn receive<const LANE: usize>(
+    forest: &Forest,
+    d: Diamond,
+    mut receiver: Receiver<'_, LANE>,
+    flags: u8,
+    bytes: usize,
+) -> Result<(Walk, Units), DecodeError> {
     let units = Units { shift: 0, base: 0, step: 1 }.pass(&mut receiver)?;
     let square = Square::new(forest, d, units.shift);
     if square.is_empty() || units.step < 1 {
         return Err(DecodeError::Symbols);
     }
-    let mut walk = Walk::new(square, flags & HOLES != 0);
+    // More are found at less than four bits each.
+    let mut walk = Walk::new(square, flags & HOLES != 0, 2 * bytes);
     walk.run(&mut receiver)?;
-    let enough = walk.triangles().len() >= TWO_LANES_TRIANGLES;
-    if !receiver.coder.is_spent() || enough != (lanes == 2) {
-        return Err(DecodeError::Symbols);
-    }
-    gather(&walk, units, d)
+    if receiver.coder.is_spent() { Ok((walk, units)) } else { Err(DecodeError::Symbols) }
 }
 
 /// The patch that a walk has found, if its units are as large as can be.
@@ -264,14 +286,14 @@ fn gather(walk: &Walk, units: Units, d: Diamond) -> Result<Patch, DecodeError> {
     for (i, point) in walk.points().enumerate() {
         odd |= point.x | point.y;
         if divisor != 1 {
-            divisor = gcd(divisor, point.height);
+            divisor = gcd(divisor, i64::from(point.height));
         }
-        let height = units.base + units.step * point.height;
+        let height = units.base + units.step * i64::from(point.height);
         if (i == 0 && point.height != 0) || height.abs() > i64::from(HEIGHT_MAX) {
             return Err(DecodeError::Height);
         }
-        let place = |middle: i64, away: i64| {
-            u32::try_from(middle + (away << units.shift)).map_err(|_| DecodeError::Place)
+        let place = |middle: i64, away: i32| {
+            u32::try_from(middle + (i64::from(away) << units.shift)).map_err(|_| DecodeError::Place)
         };
         vertices.push(Vertex {
             x: place(centre[0], point.x)?,
@@ -310,13 +332,14 @@ fn gcd(a: i64, b: i64) -> i64 {
 
 struct Sender {
     coder: Encoder,
+    tables: &'static Tables,
     mesh: Mesh,
 }
 
-struct Receiver<'a> {
+/// Of numbers in the lane; bits are in the first.
+struct Receiver<'a, const LANE: usize> {
     coder: Decoder<'a>,
-    /// That of numbers; bits go in the first.
-    lane: usize,
+    tables: &'static Tables,
 }
 
 impl Pass for Sender {
@@ -325,39 +348,46 @@ impl Pass for Sender {
         bit
     }
     fn number(&mut self, scale: &mut Scale, number: i64) -> Result<i64, Fault> {
-        numbers::encode(&mut self.coder, 1, scale, number);
+        numbers::encode(&mut self.coder, 1, self.tables, scale, number);
         Ok(number)
     }
     fn plain(&mut self, value: u32, bits: u32) -> u32 {
         numbers::plain(&mut self.coder, 1, value, bits);
         value
     }
-    fn seed(&mut self) -> Option<[Point; 2]> {
+    fn seed(&mut self) -> Option<Seed> {
         self.mesh.seed()
     }
-    fn beyond(&mut self, a: u32, b: u32) -> Beyond {
-        self.mesh.beyond(a, b)
+    fn beyond(&mut self, mark: u32) -> Beyond {
+        self.mesh.beyond(mark)
+    }
+    fn marks(&self, mark: u32) -> [u32; 2] {
+        self.mesh.marks(mark)
     }
 }
 
-impl Pass for Receiver<'_> {
-    #[inline]
+impl<const LANE: usize> Pass for Receiver<'_, LANE> {
+    #[inline(always)]
     fn bit(&mut self, context: &mut Context, _: bool) -> bool {
         self.coder.bit(context)
     }
-    #[inline]
+    #[inline(always)]
     fn number(&mut self, scale: &mut Scale, _: i64) -> Result<i64, Fault> {
-        numbers::decode(&mut self.coder, self.lane, scale).ok_or(Fault::Symbols)
+        numbers::decode::<LANE>(&mut self.coder, self.tables, scale).ok_or(Fault::Symbols)
     }
     fn plain(&mut self, _: u32, bits: u32) -> u32 {
-        numbers::read_plain(&mut self.coder, self.lane, bits)
+        numbers::read_plain::<LANE>(&mut self.coder, bits)
     }
-    fn seed(&mut self) -> Option<[Point; 2]> {
+    fn seed(&mut self) -> Option<Seed> {
         None
     }
-    #[inline]
-    fn beyond(&mut self, _: u32, _: u32) -> Beyond {
+    #[inline(always)]
+    fn beyond(&mut self, _: u32) -> Beyond {
         Beyond::Nothing
+    }
+    #[inline(always)]
+    fn marks(&self, _: u32) -> [u32; 2] {
+        [0; 2]
     }
 }
 

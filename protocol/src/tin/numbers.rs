@@ -59,13 +59,30 @@ impl Scale {
 }
 
 /// One table's shares, and the way back from a share to its symbol.
-struct Table {
+pub(super) struct Table {
     symbol: [u8; TOTAL as usize],
-    start: [u16; SYMBOLS],
-    share: [u16; SYMBOLS],
+    /// The start and the share of each symbol.
+    range: [(u16, u16); SYMBOLS],
 }
 
-static TABLES: LazyLock<Vec<Table>> = LazyLock::new(|| (0..2 * OCTAVES as usize + 2).map(table).collect());
+const TABLES: usize = 2 * OCTAVES as usize + 2;
+
+/// The shares of all classes.
+pub(super) struct Tables([Table; TABLES]);
+
+impl std::ops::Index<usize> for Tables {
+    type Output = Table;
+    #[inline(always)]
+    fn index(&self, class: usize) -> &Table {
+        &self.0[class]
+    }
+}
+
+/// The tables, made when they are first needed.
+pub(super) fn tables() -> &'static Tables {
+    static MADE: LazyLock<Box<Tables>> = LazyLock::new(|| Box::new(Tables(std::array::from_fn(table))));
+    &MADE
+}
 
 /// The ratio, in units of 2^-16, of a geometric distribution with a mean magnitude in sixteenths: on both sides of
 /// zero, or on both sides of the border between zero and -1.
@@ -111,11 +128,10 @@ fn table(class: usize) -> Table {
     let mut share: Vec<u16> = raw.iter().map(|w| (1 + w * rest / sum) as u16).collect();
     let middle = DIRECT as usize + 1;
     share[middle] += (TOTAL - share.iter().map(|s| u32::from(*s)).sum::<u32>()) as u16;
-    let mut table = Table { symbol: [0; TOTAL as usize], start: [0; SYMBOLS], share: [0; SYMBOLS] };
+    let mut table = Table { symbol: [0; TOTAL as usize], range: [(0, 0); SYMBOLS] };
     let mut start = 0usize;
     for (symbol, share) in share.into_iter().enumerate() {
-        table.start[symbol] = start as u16;
-        table.share[symbol] = share;
+        table.range[symbol] = (start as u16, share);
         table.symbol[start..start + usize::from(share)].fill(symbol as u8);
         start += usize::from(share);
     }
@@ -123,12 +139,13 @@ fn table(class: usize) -> Table {
 }
 
 /// Appends a number of magnitude below 2^30.
-pub(super) fn encode(coder: &mut Encoder, lane: u8, scale: &mut Scale, number: i64) {
+pub(super) fn encode(coder: &mut Encoder, lane: u8, tables: &Tables, scale: &mut Scale, number: i64) {
     let (class, low) = scale.table();
-    let table = &TABLES[class];
+    let table = &tables[class];
     let high = number >> low;
     let symbol = if high.abs() <= DIRECT { (high + DIRECT + 1) as usize } else { 0 };
-    coder.symbol(lane, table.start[symbol], table.share[symbol]);
+    let (start, share) = table.range[symbol];
+    coder.symbol(lane, start, share);
     if symbol == 0 {
         let beyond = (high.abs() - DIRECT) as u32;
         let bits = beyond.ilog2();
@@ -149,43 +166,46 @@ pub(super) fn plain(coder: &mut Encoder, lane: u8, value: u32, bits: u32) {
 }
 
 /// Up to 32 plain bits.
-#[inline]
-pub(super) fn read_plain(coder: &mut Decoder<'_>, lane: usize, bits: u32) -> u32 {
-    let mut states = coder.states();
-    let (low, state) = coder.plain_of(states[lane], bits.min(16));
-    states[lane] = state;
+#[inline(always)]
+pub(super) fn read_plain<const LANE: usize>(coder: &mut Decoder<'_>, bits: u32) -> u32 {
+    let (low, mut state) = coder.plain_of(coder.state(LANE), bits.min(16));
     let mut value = low;
     if bits > 16 {
-        let (high, state) = coder.plain_of(state, bits - 16);
-        states[lane] = state;
+        let high;
+        (high, state) = coder.plain_of(state, bits - 16);
         value |= high << 16;
     }
-    coder.set_states(states);
+    coder.set_state(LANE, state);
     value
 }
 
 /// The next number; `None` where it is one that no encoder writes.
-#[inline]
-pub(super) fn decode(coder: &mut Decoder<'_>, lane: usize, scale: &mut Scale) -> Option<i64> {
+#[inline(always)]
+pub(super) fn decode<const LANE: usize>(
+    coder: &mut Decoder<'_>,
+    tables: &Tables,
+    scale: &mut Scale,
+) -> Option<i64> {
     let (class, low) = scale.table();
-    let table = &TABLES[class];
-    let mut states = coder.states();
-    let slot = states[lane] % TOTAL;
-    let symbol = usize::from(table.symbol[slot as usize]);
-    let share = u32::from(table.share[symbol]);
-    states[lane] = coder.refill(share * (states[lane] >> PRECISION) + slot - u32::from(table.start[symbol]));
-    coder.set_states(states);
-    let high = if symbol == 0 {
-        let is_negative = read_plain(coder, lane, 1) == 1;
-        let bits = read_plain(coder, lane, 5);
-        let magnitude = DIRECT + (i64::from(read_plain(coder, lane, bits)) | 1 << bits);
-        if is_negative { -magnitude } else { magnitude }
-    } else {
-        symbol as i64 - DIRECT - 1
-    };
-    let number = (high << low) + if low > 0 { i64::from(read_plain(coder, lane, low)) } else { 0 };
+    let table = &tables[class % TABLES];
+    let state = coder.state(LANE);
+    let slot = state % TOTAL;
+    let symbol = usize::from(table.symbol[slot as usize]) % SYMBOLS;
+    let (start, share) = table.range[symbol];
+    let state = coder.refill(u32::from(share) * (state >> PRECISION) + slot - u32::from(start));
+    coder.set_state(LANE, state);
+    let high = if symbol == 0 { escaped::<LANE>(coder) } else { symbol as i64 - DIRECT - 1 };
+    let number = (high << low) + if low > 0 { i64::from(read_plain::<LANE>(coder, low)) } else { 0 };
     scale.learn(number);
     (number.abs() < NUMBER_MAX).then_some(number)
+}
+
+#[cold]
+fn escaped<const LANE: usize>(coder: &mut Decoder<'_>) -> i64 {
+    let is_negative = read_plain::<LANE>(coder, 1) == 1;
+    let bits = read_plain::<LANE>(coder, 5);
+    let magnitude = DIRECT + (i64::from(read_plain::<LANE>(coder, bits)) | 1 << bits);
+    if is_negative { -magnitude } else { magnitude }
 }
 
 #[cfg(test)]
@@ -202,12 +222,17 @@ mod tests {
         fn numbers_come_back(numbers in prop::collection::vec(any_number(), 0..200), expected in 0u32..1 << 24, lanes in 1usize..=2) {
             let (mut coder, mut scale) = (Encoder::default(), Scale::expecting(expected));
             for number in &numbers {
-                encode(&mut coder, 1, &mut scale, *number);
+                encode(&mut coder, 1, tables(), &mut scale, *number);
             }
             let bytes = coder.finish(lanes);
             let (mut coder, mut scale) = (Decoder::new(&bytes, lanes).unwrap(), Scale::expecting(expected));
             for number in &numbers {
-                prop_assert_eq!(decode(&mut coder, lanes - 1, &mut scale), Some(*number));
+                let back = if lanes == 1 {
+                    decode::<0>(&mut coder, tables(), &mut scale)
+                } else {
+                    decode::<1>(&mut coder, tables(), &mut scale)
+                };
+                prop_assert_eq!(back, Some(*number));
             }
             prop_assert!(coder.is_spent());
         }
@@ -215,9 +240,9 @@ mod tests {
 
     #[test]
     fn shares_fill_each_table() {
-        for table in TABLES.iter() {
-            assert_eq!(table.share.iter().map(|s| u32::from(*s)).sum::<u32>(), TOTAL);
-            assert!(table.share.iter().all(|s| *s > 0));
+        for table in &tables().0 {
+            assert_eq!(table.range.iter().map(|(_, s)| u32::from(*s)).sum::<u32>(), TOTAL);
+            assert!(table.range.iter().all(|(_, s)| *s > 0));
         }
     }
 
@@ -230,7 +255,13 @@ mod tests {
                 state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
                 let unit = ((state >> 33) as f64 + 0.5) / f64::from(1u32 << 31);
                 let magnitude = (-unit.ln() * mean as f64).round() as i64;
-                encode(&mut coder, 0, &mut scale, if state & 1 << 32 == 0 { magnitude } else { -magnitude });
+                encode(
+                    &mut coder,
+                    0,
+                    tables(),
+                    &mut scale,
+                    if state & 1 << 32 == 0 { magnitude } else { -magnitude },
+                );
             }
             // A continuous distribution of this mean, cut into ones: log2(2 e mean) bits.
             let least = (2.0 * std::f64::consts::E * mean as f64).log2();

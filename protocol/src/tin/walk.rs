@@ -16,6 +16,11 @@
 //! *Real time compression of triangle mesh connectivity* (1998), whose cut-border machine this is, and Lee,
 //! Alliez and Desbrun, *Angle-Analyzer* (2002): a gate's angles tell much of what comes.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    reason = "what lies in a diamond's square has coordinates of 25 bits, heights have 26, and a child triangle 2"
+)]
+
 use super::numbers::Scale;
 use super::{TRIANGLES_MAX, VERTICES_MAX};
 use crate::HEIGHT_MAX;
@@ -42,10 +47,20 @@ pub(super) trait Pass {
     fn number(&mut self, scale: &mut Scale, number: i64) -> Result<i64, Fault>;
     /// Likewise some bits as they are.
     fn plain(&mut self, value: u32, bits: u32) -> u32;
-    /// A sender's next triangle that the walk cannot reach, as its first two vertices.
-    fn seed(&mut self) -> Option<[Point; 2]>;
-    /// What a sender's mesh has beyond the gate from `a` to `b`.
-    fn beyond(&mut self, a: u32, b: u32) -> Beyond;
+    /// A sender's next triangle that the walk cannot reach.
+    fn seed(&mut self) -> Option<Seed>;
+    /// What a sender's mesh has beyond a gate, by the gate's mark.
+    fn beyond(&mut self, mark: u32) -> Beyond;
+    /// The marks of the gates from `a` to `v` and from `v` to `b`, beyond the triangle of the gate with this mark.
+    fn marks(&self, mark: u32) -> [u32; 2];
+}
+
+/// A part of a mesh begins with the edge between two vertices.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Seed {
+    pub(super) points: [Point; 2],
+    /// The mark of the gate between them, and that of the same edge seen from the other side.
+    pub(super) marks: [u32; 2],
 }
 
 /// Beyond a gate, as a sender knows it. A receiver's is [`Beyond::Nothing`], and means nothing.
@@ -56,12 +71,12 @@ pub(super) enum Beyond {
     Known(u32),
 }
 
-/// A vertex: in units of the payload, x and y from the diamond's centre.
+/// A vertex: in units of the payload, x and y from the diamond's centre, heights from the first one's.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Point {
-    pub(super) x: i64,
-    pub(super) y: i64,
-    pub(super) height: i64,
+    pub(super) x: i32,
+    pub(super) y: i32,
+    pub(super) height: i32,
 }
 
 /// Why a walk ends early.
@@ -112,7 +127,7 @@ impl Square {
     }
 
     /// Where a point lies; no bits of children if it is outside.
-    #[inline]
+    #[inline(always)]
     pub(super) fn within(&self, x: i64, y: i64) -> Within {
         let p = x * self.u[0] + y * self.u[1];
         let q = x * self.v[0] + y * self.v[1];
@@ -120,10 +135,15 @@ impl Square {
         if p.abs() > h || q.abs() > h || (!self.upper && q > p) {
             return Within::default();
         }
-        let bits = |flags: [bool; 5]| flags.iter().rev().fold(0u8, |bits, flag| bits << 1 | u8::from(*flag));
-        let children = bits([-q >= p.abs(), p >= q.abs(), q >= p.abs(), -p >= q.abs(), false]);
-        let outer = bits([q == -h, p == h, q == h, p == -h, !self.upper && p == q]);
-        Within { children: if self.upper { children } else { children & 0b0011 }, outer }
+        let bits =
+            |[a, b, c, d]: [bool; 4]| u8::from(a) | u8::from(b) << 1 | u8::from(c) << 2 | u8::from(d) << 3;
+        let children = bits([-q >= p.abs(), p >= q.abs(), q >= p.abs(), -p >= q.abs()]);
+        let outer = bits([q == -h, p == h, q == h, p == -h]);
+        if self.upper {
+            Within { children, outer }
+        } else {
+            Within { children: children & 0b0011, outer: outer | u8::from(p == q) << 4 }
+        }
     }
 }
 
@@ -145,6 +165,8 @@ struct Gate {
     next: u32,
     /// The third vertex of the triangle on its right.
     behind: u32,
+    /// A sender's name for it.
+    mark: u32,
     state: State,
 }
 
@@ -153,6 +175,35 @@ struct Gate {
 struct Placed {
     point: Point,
     within: Within,
+}
+
+/// An open gate with the front around it.
+#[derive(Debug, Clone, Copy)]
+struct Here {
+    at: usize,
+    gate: Gate,
+    prev: Gate,
+    next: Gate,
+    /// Where the gate starts and ends.
+    a: Placed,
+    b: Placed,
+    /// Where the gate before it starts, and the one behind it ends.
+    before: Placed,
+    after: Placed,
+}
+
+impl Here {
+    /// Whether the corner at the gate's start leaves room for an edge to `v`.
+    #[inline(always)]
+    fn start_has_room(&self, v: Point) -> bool {
+        inside(self.a.point, self.b.point, self.before.point, v)
+    }
+
+    /// Whether the corner at the gate's end does.
+    #[inline(always)]
+    fn end_has_room(&self, v: Point) -> bool {
+        inside(self.b.point, self.after.point, self.a.point, v)
+    }
 }
 
 /// All that is learnt on the way.
@@ -166,6 +217,8 @@ struct Contexts {
     seeds: [Scale; 2],
     places: [[Scale; 2]; LENGTHS],
     heights: [Scale; LENGTHS],
+    /// How far off new vertices have been of late, by each of the two rules.
+    misses: [i64; 2],
 }
 
 impl Contexts {
@@ -181,6 +234,7 @@ impl Contexts {
             seeds: [Scale::expecting(u32::try_from(half).unwrap_or(u32::MAX) / 2), Scale::expecting(64)],
             places: std::array::from_fn(|octave| [Scale::expecting(length(octave) / 2); 2]),
             heights: std::array::from_fn(|octave| Scale::expecting(4 + length(octave / 2))),
+            misses: [0; 2],
         }
     }
 }
@@ -200,36 +254,48 @@ pub(super) struct Walk {
     contexts: Contexts,
 }
 
-fn cross(a: Point, b: Point, c: Point) -> i64 {
-    (b.x - a.x) * (c.y - a.y) - (b.y - a.y) * (c.x - a.x)
+#[inline(always)]
+fn difference(a: Point, b: Point) -> [i64; 2] {
+    [i64::from(b.x) - i64::from(a.x), i64::from(b.y) - i64::from(a.y)]
 }
 
+/// Twice the area of the triangle `a`, `b`, `c`; above 0 if it turns left.
+#[inline(always)]
+pub(super) fn cross(a: Point, b: Point, c: Point) -> i64 {
+    let (u, v) = (difference(a, b), difference(a, c));
+    u[0] * v[1] - u[1] * v[0]
+}
+
+#[inline(always)]
 fn dot(a: Point, b: Point, c: Point) -> i64 {
-    (b.x - a.x) * (c.x - a.x) + (b.y - a.y) * (c.y - a.y)
+    let (u, v) = (difference(a, b), difference(a, c));
+    u[0] * v[0] + u[1] * v[1]
 }
 
 /// Whether the direction from `at` to `to` lies strictly inside the turn left from that to `from` to that to `until`:
 /// a full turn where these two are the same.
+#[inline(always)]
 fn inside(at: Point, from: Point, until: Point, to: Point) -> bool {
     let turn = cross(at, from, until);
     let (after, before) = (cross(at, from, to), cross(at, to, until));
-    if turn > 0 {
-        after > 0 && before > 0
-    } else if turn < 0 || dot(at, from, until) < 0 {
-        after > 0 || before > 0
-    } else {
-        after != 0 || dot(at, from, to) < 0
+    if turn == 0 && dot(at, from, until) > 0 {
+        return after != 0 || dot(at, from, to) < 0;
     }
+    // Without branches: which way a front turns is as random as the mesh, and would be mispredicted.
+    let (left, right) = (after > 0, before > 0);
+    (left & right) | ((turn <= 0) & (left | right))
 }
 
 impl Walk {
-    pub(super) fn new(square: Square, holes: bool) -> Self {
+    /// A walk that is expected to find about so many triangles.
+    pub(super) fn new(square: Square, holes: bool, expected: usize) -> Self {
+        let expected = expected.min(TRIANGLES_MAX);
         Self {
             holes,
-            places: Vec::new(),
-            gates: Vec::new(),
-            triangles: Vec::new(),
-            children: Vec::new(),
+            places: Vec::with_capacity(expected * 5 / 8),
+            gates: Vec::with_capacity(expected * 7 / 4),
+            triangles: Vec::with_capacity(expected),
+            children: Vec::with_capacity(expected),
             borders: 0,
             contexts: Contexts::new(square.half),
             square,
@@ -251,10 +317,7 @@ impl Walk {
         let (mut at, mut least) = (0, 0);
         loop {
             let seed = pass.seed();
-            let mut more = self.contexts.more;
-            let goes_on = pass.bit(&mut more, seed.is_some());
-            self.contexts.more = more;
-            if !goes_on {
+            if !pass.bit(&mut self.contexts.more, seed.is_some()) {
                 break;
             }
             let first = self.triangles.len();
@@ -282,103 +345,86 @@ impl Walk {
         borders.all(|gate| !std::mem::replace(&mut seen[gate.origin as usize], true))
     }
 
-    /// The first two vertices of a part of the mesh, and the two sides of the edge between them.
-    fn begin(&mut self, pass: &mut impl Pass, seed: [Point; 2]) -> Result<(), Fault> {
-        let last = self.places.last().map_or(Point::default(), |placed| placed.point);
-        let mut near = Point { x: 0, y: 0, height: last.height };
+    /// The first triangle of a part of the mesh.
+    fn begin(&mut self, pass: &mut impl Pass, seed: Seed) -> Result<(), Fault> {
+        let last = self.places.last().map_or(0, |placed| placed.point.height);
+        let mut near = [0, 0, i64::from(last)];
         let first = self.places.len();
-        for point in seed {
-            let [mut across, mut up] = self.contexts.seeds;
-            let read = Point {
-                x: near.x + pass.number(&mut across, point.x - near.x)?,
-                y: near.y + pass.number(&mut across, point.y - near.y)?,
-                height: near.height + pass.number(&mut up, point.height - near.height)?,
-            };
-            self.contexts.seeds = [across, up];
-            self.place(read)?;
-            near = read;
+        for point in seed.points {
+            let [across, up] = &mut self.contexts.seeds;
+            let wanted = [point.x, point.y, point.height].map(i64::from);
+            let x = near[0] + pass.number(across, wanted[0] - near[0])?;
+            let y = near[1] + pass.number(across, wanted[1] - near[1])?;
+            let height = near[2] + pass.number(up, wanted[2] - near[2])?;
+            self.place(x, y, height)?;
+            near = [x, y, height];
         }
-        let (a, b) = (self.places[first], self.places[first + 1]);
-        if (a.point.x, a.point.y) == (b.point.x, b.point.y) {
+        if difference(self.places[first].point, self.places[first + 1].point) == [0, 0] {
             return Err(Fault::Place);
         }
-        let [a, b] = [index(first), index(first + 1)];
+        // Two gates, one on each side of the edge. The first has a triangle for sure.
         let gate = index(self.gates.len());
-        self.push(a, b, gate + 1, gate + 1, NONE);
-        self.push(b, a, gate, gate, NONE);
-        // Its triangle is there, whatever the sides of the square say.
-        if self.gates[gate as usize].state == State::Border {
-            return Err(Fault::Place);
-        }
-        Ok(())
+        self.push([index(first), index(first + 1)], [gate + 1; 2], NONE, seed.marks[0]);
+        self.push([index(first + 1), index(first)], [gate; 2], index(first + 2), seed.marks[1]);
+        let beyond = pass.beyond(seed.marks[0]);
+        self.grow(pass, &self.here(gate as usize), beyond)
     }
 
     /// Takes a vertex in.
-    fn place(&mut self, point: Point) -> Result<u32, Fault> {
-        let within = self.square.within(point.x, point.y);
-        if within.children == 0 || point.height.abs() > 2 * i64::from(HEIGHT_MAX) {
+    #[inline(always)]
+    fn place(&mut self, x: i64, y: i64, height: i64) -> Result<Placed, Fault> {
+        let within = self.square.within(x, y);
+        if within.children == 0 || height.abs() > 2 * i64::from(HEIGHT_MAX) {
             return Err(Fault::Place);
         }
         if self.places.len() >= VERTICES_MAX {
             return Err(Fault::Size);
         }
-        self.places.push(Placed { point, within });
-        Ok(index(self.places.len() - 1))
+        // Within the square, so of 25 bits.
+        let [x, y, height] = [x, y, height].map(|w| w as i32);
+        let placed = Placed { point: Point { x, y, height }, within };
+        self.places.push(placed);
+        Ok(placed)
     }
 
-    /// A new gate from `origin` to `end`.
-    fn push(&mut self, origin: u32, end: u32, prev: u32, next: u32, behind: u32) -> u32 {
+    /// A new gate between two vertices and two gates.
+    #[inline(always)]
+    fn push(&mut self, [origin, end]: [u32; 2], [prev, next]: [u32; 2], behind: u32, mark: u32) -> u32 {
         let outer = self.places[origin as usize].within.outer & self.places[end as usize].within.outer;
-        // A part's first edge may run along the border, with its triangle on the inner side.
-        let state = if outer != 0 && (behind != NONE || self.looks_out(origin, end)) {
-            State::Border
-        } else {
-            State::Open
-        };
+        let state = if outer == 0 { State::Open } else { State::Border };
         let number = index(self.gates.len());
-        self.gates.push(Gate { origin, prev, next, behind, state });
+        self.gates.push(Gate { origin, prev, next, behind, mark, state });
         number
-    }
-
-    /// Whether the left side of an edge along the square's border lies outside.
-    fn looks_out(&self, origin: u32, end: u32) -> bool {
-        let (a, b) = (self.point(origin), self.point(end));
-        // Somewhere inside of a convex square: the middle of the lower triangle's centroid.
-        let Square { u, v, half, .. } = self.square;
-        let inner = Point { x: (u[0] - v[0]) * half, y: (u[1] - v[1]) * half, height: 0 };
-        let thrice = |p: Point| Point { x: 3 * p.x, y: 3 * p.y, height: 0 };
-        cross(thrice(a), thrice(b), inner) < 0
     }
 
     fn point(&self, vertex: u32) -> Point {
         self.places[vertex as usize].point
     }
 
+    #[inline(always)]
     fn gate(&self, gate: u32) -> Gate {
         self.gates[gate as usize]
     }
 
-    fn link(&mut self, prev: u32, next: u32) {
-        self.gates[prev as usize].next = next;
-        self.gates[next as usize].prev = prev;
+    #[inline(always)]
+    fn here(&self, at: usize) -> Here {
+        let gate = self.gates[at];
+        let (prev, next) = (self.gate(gate.prev), self.gate(gate.next));
+        let [a, b, before, after] = [gate.origin, next.origin, prev.origin, self.gate(next.next).origin]
+            .map(|vertex| self.places[vertex as usize]);
+        Here { at, gate, prev, next, a, b, before, after }
     }
 
     /// Settles what lies beyond a gate.
+    #[inline(always)]
     fn step(&mut self, pass: &mut impl Pass, at: usize) -> Result<(), Fault> {
-        let gate = self.gates[at];
-        let (prev, next) = (self.gate(gate.prev), self.gate(gate.next));
-        let (a, b) = (gate.origin, next.origin);
-        let beyond = pass.beyond(a, b);
-        // The first edge of a part has a triangle for sure.
-        let first = gate.behind == NONE && gate.prev == gate.next && gate.prev as usize > at;
-        if first {
-            return self.grow(pass, at, beyond);
-        }
+        let here = self.here(at);
+        let Here { gate, prev, next, .. } = here;
+        let beyond = pass.beyond(gate.mark);
         let alone = prev.prev == gate.next;
-        let can_left = prev.state == State::Open && (!alone || next.state == State::Open);
-        let can_right = next.state == State::Open && !alone;
-        let left = if can_left { self.angle(a, b, prev.origin) } else { 0 };
-        let right = if can_right { self.angle(a, b, self.gate(next.next).origin) } else { 0 };
+        let (before, behind) = (prev.state == State::Open, next.state == State::Open);
+        let left = angle(&here, &here.before, before & (!alone | behind));
+        let right = angle(&here, &here.after, behind & !alone);
         if self.holes {
             let context =
                 usize::from(prev.state == State::Border) * 2 + usize::from(next.state == State::Border);
@@ -389,147 +435,128 @@ impl Walk {
             }
         }
         if pass.bit(&mut self.contexts.new[left][right], matches!(beyond, Beyond::New(_))) {
-            return self.grow(pass, at, beyond);
+            return self.grow(pass, &here, beyond);
         }
         let known = if let Beyond::Known(vertex) = beyond { vertex } else { NONE };
         if left > 0 && pass.bit(&mut self.contexts.left[left][right], known == prev.origin) {
-            return self.join_left(at);
+            return self.join_left(pass, &here);
         }
         let end = self.gate(next.next).origin;
         if right > 0 && pass.bit(&mut self.contexts.right[right], known == end) {
-            return self.join_right(at);
+            return self.join_right(pass, &here);
         }
         self.join_other(pass, at, known)
     }
 
-    /// The class of the angle at `v` of a triangle, 0 if there can be none.
-    fn angle(&self, a: u32, b: u32, v: u32) -> usize {
-        let [from, to, at] = [a, b, v].map(|vertex| self.places[vertex as usize]);
-        let (sine, cosine) = (cross(from.point, to.point, at.point), dot(at.point, from.point, to.point));
-        let within = from.within.children & to.within.children & at.within.children;
-        if sine <= 0 || within == 0 {
-            0
-        } else if cosine <= -sine {
-            5
-        } else if cosine <= 0 {
-            4
-        } else if cosine <= sine / 2 {
-            3
-        } else if cosine <= sine {
-            2
-        } else {
-            1
-        }
-    }
-
     /// The gate's triangle, if it can be one.
-    fn triangle(&mut self, at: usize, v: u32) -> Result<(), Fault> {
-        let (a, b) = (self.gates[at].origin, self.gate(self.gates[at].next).origin);
-        let [from, to, apex] = [a, b, v].map(|vertex| self.places[vertex as usize]);
-        let within = from.within.children & to.within.children & apex.within.children;
-        if within == 0 || cross(from.point, to.point, apex.point) <= 0 {
+    #[inline(always)]
+    fn triangle(&mut self, here: &Here, v: u32, apex: &Placed) -> Result<(), Fault> {
+        let within = here.a.within.children & here.b.within.children & apex.within.children;
+        if within == 0 || cross(here.a.point, here.b.point, apex.point) <= 0 {
             return Err(Fault::Place);
         }
         if self.triangles.len() >= TRIANGLES_MAX {
             return Err(Fault::Size);
         }
-        self.triangles.push([a, b, v]);
+        self.triangles.push([here.gate.origin, here.next.origin, v]);
         // Closed child triangles share lines only, so there is one bit.
-        self.children.push(u8::try_from(within.trailing_zeros()).unwrap_or(0));
-        self.gates[at].state = State::Done;
+        self.children.push(within.trailing_zeros() as u8);
+        self.gates[here.at].state = State::Done;
         Ok(())
     }
 
-    /// Whether the corner at the gate's start, or end, leaves room for an edge to `v`.
-    fn has_room(&self, at: usize, v: Point) -> [bool; 2] {
-        let gate = self.gates[at];
-        let (prev, next) = (self.gate(gate.prev), self.gate(gate.next));
-        let [a, b, before, after] =
-            [gate.origin, next.origin, prev.origin, self.gate(next.next).origin].map(|i| self.point(i));
-        [inside(a, b, before, v), inside(b, after, a, v)]
-    }
-
     /// A triangle with a new vertex.
-    fn grow(&mut self, pass: &mut impl Pass, at: usize, beyond: Beyond) -> Result<(), Fault> {
-        let gate = self.gates[at];
-        let (a, b) = (gate.origin, self.gate(gate.next).origin);
+    #[inline(always)]
+    fn grow(&mut self, pass: &mut impl Pass, here: &Here, beyond: Beyond) -> Result<(), Fault> {
+        let (a, b) = (here.a.point, here.b.point);
         let wanted = if let Beyond::New(point) = beyond { point } else { Point::default() };
-        let point = self.receive(pass, [a, b, gate.behind], wanted)?;
-        if self.has_room(at, point) != [true; 2] {
+        let behind = (here.gate.behind != NONE).then(|| self.point(here.gate.behind));
+        let length = b.x.abs_diff(a.x).max(b.y.abs_diff(a.y)).max(1).ilog2() as usize;
+        let length = length.min(LENGTHS - 1);
+        let rules = expected_places(a, b, behind);
+        let [x, y] = rules[usize::from(self.contexts.misses[1] < self.contexts.misses[0])];
+        let [along_x, along_y] = &mut self.contexts.places[length];
+        let x = x + pass.number(along_x, i64::from(wanted.x) - x)?;
+        let y = y + pass.number(along_y, i64::from(wanted.y) - y)?;
+        for (misses, rule) in self.contexts.misses.iter_mut().zip(rules) {
+            // Numbers are below 2^30, so the means are below 2^36.
+            *misses += (x - rule[0]).abs() + (y - rule[1]).abs() - (*misses >> 5);
+        }
+        let height = expected_height(a, b, behind, x, y);
+        let height =
+            height + pass.number(&mut self.contexts.heights[length], i64::from(wanted.height) - height)?;
+        let placed = self.place(x, y, height)?;
+        if !here.start_has_room(placed.point) || !here.end_has_room(placed.point) {
             return Err(Fault::Place);
         }
-        let v = self.place(point)?;
-        self.triangle(at, v)?;
-        let to = self.push(a, v, gate.prev, NONE, b);
-        let from = self.push(v, b, to, gate.next, a);
-        self.link(gate.prev, to);
-        self.link(to, from);
-        self.link(from, gate.next);
-        if gate.behind == NONE {
-            // The first edge of a part: its other side is the gate before, and behind.
-            self.gates[gate.prev as usize].behind = v;
-        }
+        let v = index(self.places.len() - 1);
+        self.triangle(here, v, &placed)?;
+        let Gate { origin, prev, next, mark, .. } = here.gate;
+        let marks = pass.marks(mark);
+        let to = self.push([origin, v], [prev, NONE], here.next.origin, marks[0]);
+        let from = self.push([v, here.next.origin], [to, next], origin, marks[1]);
+        self.gates[to as usize].next = from;
+        self.gates[prev as usize].next = to;
+        self.gates[next as usize].prev = from;
         Ok(())
     }
 
     /// A triangle with the start of the gate before.
-    fn join_left(&mut self, at: usize) -> Result<(), Fault> {
-        let gate = self.gates[at];
-        let prev = self.gate(gate.prev);
-        let (a, b, v) = (gate.origin, self.gate(gate.next).origin, prev.origin);
-        let closes = prev.prev == gate.next;
+    #[inline(always)]
+    fn join_left(&mut self, pass: &impl Pass, here: &Here) -> Result<(), Fault> {
+        let Here { gate, prev, next, before: apex, .. } = *here;
+        let (v, closes) = (prev.origin, prev.prev == gate.next);
         if !closes {
             let before = self.point(self.gate(prev.prev).origin);
-            let room = inside(self.point(v), self.point(a), before, self.point(b));
-            if !room || !self.has_room(at, self.point(v))[1] {
+            let room = inside(apex.point, here.a.point, before, here.b.point);
+            if !room || !here.end_has_room(apex.point) {
                 return Err(Fault::Place);
             }
         }
-        self.triangle(at, v)?;
+        self.triangle(here, v, &apex)?;
         self.gates[gate.prev as usize].state = State::Done;
         if closes {
             self.gates[gate.next as usize].state = State::Done;
             return Ok(());
         }
-        let from = self.push(v, b, prev.prev, gate.next, a);
-        self.link(prev.prev, from);
-        self.link(from, gate.next);
+        let from = self.push([v, next.origin], [prev.prev, gate.next], gate.origin, pass.marks(gate.mark)[1]);
+        self.gates[prev.prev as usize].next = from;
+        self.gates[gate.next as usize].prev = from;
         Ok(())
     }
 
     /// A triangle with the end of the gate behind.
-    fn join_right(&mut self, at: usize) -> Result<(), Fault> {
-        let gate = self.gates[at];
-        let next = self.gate(gate.next);
+    #[inline(always)]
+    fn join_right(&mut self, pass: &impl Pass, here: &Here) -> Result<(), Fault> {
+        let Here { gate, next, after: apex, .. } = *here;
         let beyond = self.gate(next.next);
-        let (a, b, v) = (gate.origin, next.origin, beyond.origin);
         let after = self.point(self.gate(beyond.next).origin);
-        let room = inside(self.point(v), after, self.point(b), self.point(a));
-        if !room || !self.has_room(at, self.point(v))[0] {
+        let room = inside(apex.point, after, here.b.point, here.a.point);
+        if !room || !here.start_has_room(apex.point) {
             return Err(Fault::Place);
         }
-        self.triangle(at, v)?;
+        self.triangle(here, beyond.origin, &apex)?;
         self.gates[gate.next as usize].state = State::Done;
-        let to = self.push(a, v, gate.prev, next.next, b);
-        self.link(gate.prev, to);
-        self.link(to, next.next);
+        let ends = [gate.origin, beyond.origin];
+        let to = self.push(ends, [gate.prev, next.next], next.origin, pass.marks(gate.mark)[0]);
+        self.gates[gate.prev as usize].next = to;
+        self.gates[next.next as usize].prev = to;
         Ok(())
     }
 
     /// Whether a triangle's corner fits in at the start of the gate `out`.
-    fn fits(&self, at: usize, out: u32) -> bool {
+    fn fits(&self, here: &Here, out: u32) -> bool {
         let gate = self.gate(out);
-        let (a, b) = (self.gates[at].origin, self.gate(self.gates[at].next).origin);
-        let [v, before, after, a, b] =
-            [gate.origin, self.gate(gate.prev).origin, self.gate(gate.next).origin, a, b]
-                .map(|i| self.point(i));
-        gate.state != State::Done && inside(v, after, before, a) && inside(v, after, before, b)
+        let [v, before, after] = [gate.origin, self.gate(gate.prev).origin, self.gate(gate.next).origin]
+            .map(|vertex| self.point(vertex));
+        gate.state != State::Done
+            && inside(v, after, before, here.a.point)
+            && inside(v, after, before, here.b.point)
     }
 
     /// The first place along the loop for which `is` holds: so many steps ahead, or behind if negative.
-    fn look_around(&self, at: usize, mut is: impl FnMut(i64, u32) -> bool) -> Option<(i64, u32)> {
-        let gate = self.gates[at];
-        let (mut ahead, mut behind) = (self.gate(gate.next).next, gate.prev);
+    fn look_around(&self, here: &Here, mut is: impl FnMut(i64, u32) -> bool) -> Option<(i64, u32)> {
+        let (mut ahead, mut behind) = (here.next.next, here.gate.prev);
         for steps in 1..=REACH {
             if ahead == behind {
                 return None;
@@ -553,76 +580,88 @@ impl Walk {
     }
 
     /// A triangle with another vertex of a front.
+    #[cold]
+    #[inline(never)]
     fn join_other(&mut self, pass: &mut impl Pass, at: usize, known: u32) -> Result<(), Fault> {
-        let found = self.look_around(at, |_, out| self.gate(out).origin == known && self.fits(at, out));
+        let here = &self.here(at);
+        let is_known = |walk: &Self, out: u32| walk.gate(out).origin == known && walk.fits(here, out);
+        let found = self.look_around(here, |_, out| is_known(self, out));
         let steps = pass.number(&mut self.contexts.other, found.map_or(0, |(steps, _)| steps))?;
         let out = if steps == 0 {
-            let far = (0..index(self.gates.len()))
-                .find(|out| self.gate(*out).origin == known && self.fits(at, *out));
-            let far = far.filter(|_| known != NONE).unwrap_or(0);
+            let far = if known == NONE {
+                None
+            } else {
+                (0..index(self.gates.len())).find(|out| is_known(self, *out))
+            };
+            let far = far.unwrap_or(0);
             // Each triangle makes two gates at most, each part of the mesh two more.
             let out = pass.plain(far & 0xffff, 16) | pass.plain(far >> 16, 4) << 16;
-            if out as usize >= self.gates.len() || self.look_around(at, |_, near| near == out).is_some() {
+            if out as usize >= self.gates.len() || self.look_around(here, |_, near| near == out).is_some() {
                 return Err(Fault::Symbols);
             }
             out
         } else {
-            self.look_around(at, |here, _| here == steps).ok_or(Fault::Symbols)?.1
+            self.look_around(here, |now, _| now == steps).ok_or(Fault::Symbols)?.1
         };
-        let gate = self.gates[at];
-        let (v, incoming) = (self.gate(out).origin, self.gate(out).prev);
-        if !self.fits(at, out) || self.has_room(at, self.point(v)) != [true; 2] {
+        let Gate { origin: v, prev: incoming, .. } = self.gate(out);
+        let apex = self.places[v as usize];
+        let room = here.start_has_room(apex.point) && here.end_has_room(apex.point);
+        if !room || !self.fits(here, out) {
             return Err(Fault::Place);
         }
-        let (a, b) = (gate.origin, self.gate(gate.next).origin);
-        self.triangle(at, v)?;
-        let to = self.push(a, v, gate.prev, out, b);
-        let from = self.push(v, b, incoming, gate.next, a);
-        self.link(gate.prev, to);
-        self.link(to, out);
-        self.link(incoming, from);
-        self.link(from, gate.next);
+        self.triangle(here, v, &apex)?;
+        let Gate { origin, prev, next, mark, .. } = here.gate;
+        let marks = pass.marks(mark);
+        let to = self.push([origin, v], [prev, out], here.next.origin, marks[0]);
+        let from = self.push([v, here.next.origin], [incoming, next], origin, marks[1]);
+        self.gates[prev as usize].next = to;
+        self.gates[out as usize].prev = to;
+        self.gates[incoming as usize].next = from;
+        self.gates[next as usize].prev = from;
         Ok(())
-    }
-
-    /// A new vertex beyond a gate, as its difference from what is expected there.
-    fn receive(&mut self, pass: &mut impl Pass, gate: [u32; 3], wanted: Point) -> Result<Point, Fault> {
-        let [a, b] = [gate[0], gate[1]].map(|vertex| self.point(vertex));
-        let behind = (gate[2] != NONE).then(|| self.point(gate[2]));
-        let (x, y) = expected_place(a, b, behind);
-        let length = (b.x - a.x).abs().max((b.y - a.y).abs()).max(1).ilog2() as usize;
-        let length = length.min(LENGTHS - 1);
-        let [along_x, along_y] = &mut self.contexts.places[length];
-        let x = x + pass.number(along_x, wanted.x - x)?;
-        let y = y + pass.number(along_y, wanted.y - y)?;
-        let height = expected_height(a, b, behind, x, y);
-        let height = height + pass.number(&mut self.contexts.heights[length], wanted.height - height)?;
-        Ok(Point { x, y, height })
     }
 }
 
-/// Where the third vertex of a triangle beyond a gate is expected.
-fn expected_place(a: Point, b: Point, behind: Option<Point>) -> (i64, i64) {
-    match behind {
-        Some(c) => (a.x + b.x - c.x, a.y + b.y - c.y),
-        // That of a triangle of three equal sides.
-        None => ((a.x + b.x) / 2 - (b.y - a.y) * 7 / 8, (a.y + b.y) / 2 + (b.x - a.x) * 7 / 8),
-    }
+/// The class of the angle at `v` of a gate's triangle, 0 if there can be none, or none is wanted.
+#[inline(always)]
+fn angle(here: &Here, v: &Placed, wanted: bool) -> usize {
+    let (sine, cosine) =
+        (cross(here.a.point, here.b.point, v.point), dot(v.point, here.a.point, here.b.point));
+    let within = here.a.within.children & here.b.within.children & v.within.children;
+    // 45 degrees, some 63, 90, 135. Without branches, as above.
+    let class = 1
+        + usize::from(cosine <= sine)
+        + usize::from(cosine <= sine / 2)
+        + usize::from(cosine <= 0)
+        + usize::from(cosine <= -sine);
+    class * usize::from((sine > 0) & (within != 0) & wanted)
+}
+
+/// Where the third vertex of a triangle beyond a gate is expected, by two rules: as far as that of the triangle behind,
+/// which regular meshes follow; or half as far as the gate is long, straight ahead.
+#[inline(always)]
+fn expected_places(a: Point, b: Point, behind: Option<Point>) -> [[i64; 2]; 2] {
+    let (x, y) = (i64::from(a.x) + i64::from(b.x), i64::from(a.y) + i64::from(b.y));
+    let [dx, dy] = difference(a, b);
+    let ahead = [(x - dy) >> 1, (y + dx) >> 1];
+    [behind.map_or(ahead, |c| [x - i64::from(c.x), y - i64::from(c.y)]), ahead]
 }
 
 /// The height of the plane of the triangle on the gate's right, seen from beyond.
+#[inline(always)]
 fn expected_height(a: Point, b: Point, behind: Option<Point>, x: i64, y: i64) -> i64 {
-    let level = (a.height + b.height) / 2;
-    let Some(c) = behind else { return level };
-    let v = Point { x, y, height: 0 };
-    let whole = cross(a, c, b);
-    let (s, t) = (cross(a, c, v), -cross(a, b, v));
+    let [from, to] = [a, b].map(|p| i64::from(p.height));
+    let Some(c) = behind else { return (from + to) / 2 };
+    let (along, back) = (difference(a, b), difference(a, c));
+    let here = [x - i64::from(a.x), y - i64::from(a.y)];
+    let whole = back[0] * along[1] - back[1] * along[0];
+    let (s, t) = (back[0] * here[1] - back[1] * here[0], here[0] * along[1] - here[1] * along[0]);
     // 34 bits and 3 and those of a difference of heights fit in 63.
     let shift = (64 - whole.leading_zeros()).saturating_sub(34);
     let whole = (whole >> shift).max(1);
     let clamp = |part: i64| (part >> shift).clamp(-4 * whole, 4 * whole);
     let (s, t) = (clamp(s), clamp(t));
-    a.height + (s * (b.height - a.height) + t * (c.height - a.height)).div_euclid(whole)
+    from + (s * (to - from) + t * (i64::from(c.height) - from)).div_euclid(whole)
 }
 
 fn index(count: usize) -> u32 {

@@ -69,7 +69,9 @@ impl Tins<'_> {
         let boxes = diamonds.iter().map(|d| forest.bounds(*d));
         // What is made of the finest levels reaches beyond the tile's own diamonds.
         let children = diamonds.iter().filter(|_| input.is_none()).flat_map(|d| deep.children(*d)).flatten();
-        let Some(bounds) = around(boxes.chain(children.map(|c| deep.bounds(c)))) else { return Ok(tile) };
+        let around_child = |c: Diamond| std::iter::once(c).chain(deep.children(c).into_iter().flatten());
+        let beyond = children.flat_map(around_child).map(|c| deep.bounds(c));
+        let Some(bounds) = around(boxes.chain(beyond)) else { return Ok(tile) };
         let wants_all = self.options.patch_error.is_some() || input.is_none();
         let window = if level > 0 && (wants_all || samples(bounds) <= WINDOW_SAMPLES) {
             Some(self.canvas.read(0, bounds[0], bounds[1]).map_err(&failed)?)
