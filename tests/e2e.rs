@@ -31,6 +31,8 @@ mod seams;
 mod stream;
 /// The house: who may import whom, how long a file may be.
 mod tidy;
+/// Laws 2, 3, 6 and 7 for triangles: borders fit, declared errors hold, killed builds go on, and are served.
+mod tin;
 /// Law 3: declared errors hold at every sample of real DEMs.
 mod truth;
 /// The harness: synthetic DEM → store → server on a free port → client, and a network that misbehaves.

@@ -27,9 +27,9 @@ const SERVER: &[(&str, &[&str])] = &[
     ("chunks", &[]),
     ("measure", &[]),
     ("progress", &[]),
-    ("simplify", &[]),
+    ("tin", &[]),
     ("store", &[]),
-    ("hierarchy", &["canvas", "chunks", "ingest", "measure", "progress", "simplify", "store"]),
+    ("hierarchy", &["canvas", "chunks", "ingest", "measure", "progress", "store", "tin"]),
     ("inspect", &["chunks", "store"]),
     ("height", &["inspect", "projection", "store"]),
     ("stream", &["inspect", "store"]),
@@ -39,10 +39,7 @@ const SERVER: &[(&str, &[&str])] = &[
     ("client_program", &[]),
     ("demo", &["client_program", "hierarchy", "http", "ingest", "progress", "sample"]),
     ("zone", &["height", "inspect", "progress", "projection", "store"]),
-    (
-        "experiment",
-        &["canvas", "client_program", "hierarchy", "http", "ingest", "measure", "progress", "simplify"],
-    ),
+    ("experiment", &["canvas", "client_program", "hierarchy", "http", "ingest", "measure", "progress"]),
 ];
 
 /// `cut` is a pure function of what it is given; the GPU is `render`'s and the fronts'.

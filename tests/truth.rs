@@ -290,7 +290,7 @@ fn check(case: &Case<'_>, samples: &Samples) {
 }
 
 /// Files of the manifest that are DEMs, with the options without which they cannot be read.
-fn dems(folder: &Path) -> Vec<(PathBuf, ingest::Options)> {
+pub(crate) fn dems(folder: &Path) -> Vec<(PathBuf, ingest::Options)> {
     let manifest = std::fs::read_to_string(folder.join("MANIFEST.tsv")).unwrap();
     let lines = manifest.lines().skip(1).map(|line| line.split('\t').collect::<Vec<_>>());
     lines

@@ -217,8 +217,8 @@ fn decode(
     if payload.is_none() {
         // No payload is right only where the index says so.
         let page = diamantina_protocol::index::page_of(&layer.forest, d);
-        let entries =
-            read_page(store, number, layer, page).map_err(|e| HeightError::Damaged(e.to_string()))?;
+        let entries = read_page(store, number, layer, Kind::Index, page)
+            .map_err(|e| HeightError::Damaged(e.to_string()))?;
         if entries.iter().any(|(other, e)| *other == d && e.bytes > 0) {
             return Err(HeightError::Damaged(format!("the points of diamond {:?} are missing", [a, b])));
         }

@@ -15,6 +15,7 @@ use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::middleware::{self, Next};
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
+use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::index;
 use diamantina_protocol::message::{
     self, BATCH_MAX, Catalogue, FrameHeader, Layer, PAYLOAD_BYTES_MAX, Problem, STREAM_MAX, Scene, Status,
@@ -196,6 +197,9 @@ pub fn router(scenes: Scenes) -> Router {
         .route("/scenes/{scene}/{version}/{layer}/index/{page}", get(index_page))
         .route("/scenes/{scene}/{version}/{layer}/points", get(batch))
         .route("/scenes/{scene}/{version}/{layer}/points/{x}/{y}", get(diamond))
+        .route("/scenes/{scene}/{version}/{layer}/tin/index/{page}", get(tin_index_page))
+        .route("/scenes/{scene}/{version}/{layer}/tin", get(tin_batch))
+        .route("/scenes/{scene}/{version}/{layer}/tin/{x}/{y}", get(tin_diamond))
         .route("/scenes/{scene}/{version}/{layer}/stream", get(stream))
         .fallback(|| async {
             Refusal::new(StatusCode::NOT_FOUND, "no such address: GET /scenes lists what there is")
@@ -341,20 +345,92 @@ async fn scene(
     Ok(json(&headers, find_scene(&scenes, &name)?.scene()))
 }
 
-async fn index_page(
-    State(scenes): State<Scenes>,
-    UrlPath((name, version, layer, page)): UrlPath<(String, String, String, String)>,
+/// One of the encodings of a layer.
+#[derive(Clone, Copy)]
+struct Encoding {
+    forest: Forest,
+    payload: Kind,
+    page: Kind,
+    /// What ETags of its payloads and pages have in front.
+    letters: [&'static str; 2],
+}
+
+/// The encoding `points` of a layer.
+fn points(layer: &Layer) -> Result<Encoding, Refusal> {
+    if !layer.encodings.iter().any(|e| e == "points") {
+        return Err(Refusal::new(
+            StatusCode::NOT_FOUND,
+            "this layer has no points, only what its encodings list",
+        ));
+    }
+    Ok(Encoding { forest: layer.forest, payload: Kind::Points, page: Kind::Index, letters: ["p", "i"] })
+}
+
+/// The encoding `tin` of a layer.
+fn tin(layer: &Layer) -> Result<Encoding, Refusal> {
+    let Some(tin) = &layer.tin else {
+        return Err(Refusal::new(
+            StatusCode::NOT_FOUND,
+            "this layer has no triangles: build it with --encoding points,tin",
+        ));
+    };
+    Ok(Encoding { forest: tin.forest, payload: Kind::Tin, page: Kind::TinIndex, letters: ["t", "j"] })
+}
+
+type PagePath = UrlPath<(String, String, String, String)>;
+type DiamondPath = UrlPath<(String, String, String, String, String)>;
+type BatchPath = UrlPath<(String, String, String)>;
+type Ask = Query<HashMap<String, String>>;
+
+async fn index_page(state: State<Scenes>, path: PagePath, headers: HeaderMap) -> Result<Response, Refusal> {
+    page_of(&state, path, &headers, points)
+}
+
+async fn tin_index_page(
+    state: State<Scenes>,
+    path: PagePath,
     headers: HeaderMap,
 ) -> Result<Response, Refusal> {
-    let store = find_version(&scenes, &name, &version)?;
+    page_of(&state, path, &headers, tin)
+}
+
+async fn diamond(state: State<Scenes>, path: DiamondPath, headers: HeaderMap) -> Result<Response, Refusal> {
+    diamond_of(&state, path, &headers, points)
+}
+
+async fn tin_diamond(
+    state: State<Scenes>,
+    path: DiamondPath,
+    headers: HeaderMap,
+) -> Result<Response, Refusal> {
+    diamond_of(&state, path, &headers, tin)
+}
+
+async fn batch(state: State<Scenes>, path: BatchPath, query: Ask) -> Result<Response, Refusal> {
+    batch_of(&state, path, &query, points)
+}
+
+async fn tin_batch(state: State<Scenes>, path: BatchPath, query: Ask) -> Result<Response, Refusal> {
+    batch_of(&state, path, &query, tin)
+}
+
+fn page_of(
+    scenes: &Scenes,
+    UrlPath((name, version, layer, page)): PagePath,
+    headers: &HeaderMap,
+    encoding: fn(&Layer) -> Result<Encoding, Refusal>,
+) -> Result<Response, Refusal> {
+    let store = find_version(scenes, &name, &version)?;
     let (number, layer) = find_layer(store, &layer)?;
-    let pages = index::pages(&layer.forest);
+    let encoding = encoding(layer)?;
+    let pages = index::pages(&encoding.forest);
     let missing = || {
         Refusal::new(StatusCode::NOT_FOUND, format!("no such page: the index has pages 0 to {}", pages - 1))
     };
     let page: u32 = page.parse().map_err(|_| missing())?;
-    let blob = store.get(Key { layer: number, kind: Kind::Index, a: page, b: 0 })?.ok_or_else(missing)?;
-    Ok(tagged(&headers, &format!("{version}-{number}-i{page}"), IMMUTABLE, OCTETS, || blob.into()))
+    let blob = store.get(Key { layer: number, kind: encoding.page, a: page, b: 0 })?.ok_or_else(missing)?;
+    let tag = format!("{version}-{number}-{}{page}", encoding.letters[1]);
+    Ok(tagged(headers, &tag, IMMUTABLE, OCTETS, || blob.into()))
 }
 
 async fn zone(
@@ -370,31 +446,35 @@ async fn zone(
     Ok(tagged(&headers, &format!("{version}-z{position}"), IMMUTABLE, OCTETS, || blob.into()))
 }
 
-async fn diamond(
-    State(scenes): State<Scenes>,
-    UrlPath((name, version, layer, x, y)): UrlPath<(String, String, String, String, String)>,
-    headers: HeaderMap,
+fn diamond_of(
+    scenes: &Scenes,
+    UrlPath((name, version, layer, x, y)): DiamondPath,
+    headers: &HeaderMap,
+    encoding: fn(&Layer) -> Result<Encoding, Refusal>,
 ) -> Result<Response, Refusal> {
-    let store = find_version(&scenes, &name, &version)?;
+    let store = find_version(scenes, &name, &version)?;
     let (number, layer) = find_layer(store, &layer)?;
+    let encoding = encoding(layer)?;
     let no_diamond = || Refusal::new(StatusCode::NOT_FOUND, "no diamond with a payload has its centre there");
     let centre = [x.parse().map_err(|_| no_diamond())?, y.parse().map_err(|_| no_diamond())?];
-    layer.forest.diamond(centre).ok_or_else(no_diamond)?;
+    encoding.forest.diamond(centre).ok_or_else(no_diamond)?;
     let blob = store
-        .get(Key { layer: number, kind: Kind::Points, a: centre[0], b: centre[1] })?
+        .get(Key { layer: number, kind: encoding.payload, a: centre[0], b: centre[1] })?
         .ok_or_else(no_diamond)?;
-    Ok(tagged(&headers, &format!("{version}-{number}-p{x}-{y}"), IMMUTABLE, OCTETS, || blob.into()))
+    let tag = format!("{version}-{number}-{}{x}-{y}", encoding.letters[0]);
+    Ok(tagged(headers, &tag, IMMUTABLE, OCTETS, || blob.into()))
 }
 
-async fn batch(
-    State(scenes): State<Scenes>,
-    UrlPath((name, version, layer)): UrlPath<(String, String, String)>,
-    Query(query): Query<HashMap<String, String>>,
+fn batch_of(
+    scenes: &Scenes,
+    UrlPath((name, version, layer)): BatchPath,
+    query: &HashMap<String, String>,
+    encoding: fn(&Layer) -> Result<Encoding, Refusal>,
 ) -> Result<Response, Refusal> {
-    let store = Arc::clone(find_version(&scenes, &name, &version)?);
-    let (number, forest) = {
+    let store = Arc::clone(find_version(scenes, &name, &version)?);
+    let (number, Encoding { forest, payload, .. }) = {
         let (number, layer) = find_layer(&store, &layer)?;
-        (number, layer.forest)
+        (number, encoding(layer)?)
     };
     let list =
         query.get("d").ok_or_else(|| Refusal::new(StatusCode::BAD_REQUEST, "expected ?d=x,y;x,y;..."))?;
@@ -413,7 +493,7 @@ async fn batch(
     tokio::task::spawn_blocking(move || {
         for (_, centre) in order {
             // The reader went away: stop reading for it.
-            if sender.blocking_send(Ok(batch_frame(&store, number, centre))).is_err() {
+            if sender.blocking_send(Ok(batch_frame(&store, number, payload, centre))).is_err() {
                 break;
             }
         }
@@ -425,8 +505,8 @@ async fn batch(
 }
 
 /// One frame of a batch: header and payload.
-fn batch_frame(store: &Store, layer: u8, centre: [u32; 2]) -> Bytes {
-    let blob = store.get(Key { layer, kind: Kind::Points, a: centre[0], b: centre[1] });
+fn batch_frame(store: &Store, layer: u8, kind: Kind, centre: [u32; 2]) -> Bytes {
+    let blob = store.get(Key { layer, kind, a: centre[0], b: centre[1] });
     let mut out = Vec::new();
     match blob {
         Ok(Some(payload)) if payload.len() as u64 <= u64::from(PAYLOAD_BYTES_MAX) => {
@@ -452,6 +532,7 @@ async fn stream(
 ) -> Result<Response, Refusal> {
     let store = Arc::clone(find_version(&scenes, &name, &version)?);
     let (number, layer) = find_layer(&store, &layer)?;
+    points(layer)?;
     let ask = message::parse_stream(query.iter().map(|(name, value)| (name.as_str(), value.as_str())))
         .map_err(|e| Refusal::new(StatusCode::BAD_REQUEST, e.to_string()))?;
     // However it was written, the same question has the same tag.
@@ -485,7 +566,7 @@ async fn height_at(
     Query(query): Query<HashMap<String, String>>,
 ) -> Result<Response, Refusal> {
     let store = Arc::clone(find_scene(&scenes, &name)?);
-    find_layer(&store, &layer)?;
+    points(find_layer(&store, &layer)?.1)?;
     let number = |key: &str| -> Result<Option<f64>, Refusal> {
         let Some(text) = query.get(key) else { return Ok(None) };
         let value = text.parse::<f64>().ok().filter(|v| v.is_finite());

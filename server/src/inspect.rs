@@ -1,5 +1,9 @@
 //! What a store holds: levels, bytes, errors; and, on request, whether every blob is intact.
 
+mod tin;
+
+pub use tin::{TinInspection, TinLevel};
+
 use crate::chunks::Chunks;
 use crate::store::{Key, Kind, Store, StoreError, zones};
 use diamantina_protocol::diamond::{Block, Diamond};
@@ -48,7 +52,7 @@ pub enum InspectError {
         error: std::io::Error,
     },
     /// A payload is not there.
-    #[error("layer {layer}: the points of diamond {centre:?} are missing; build the store again")]
+    #[error("layer {layer}: the payload of diamond {centre:?} is missing; build the store again")]
     NoPoints {
         /// The layer.
         layer: String,
@@ -57,7 +61,7 @@ pub enum InspectError {
     },
     /// A payload is not what the index says.
     #[error(
-        "layer {layer}: the points of diamond {centre:?} have {found} bytes, the index says {expected}; build the store again"
+        "layer {layer}: the payload of diamond {centre:?} has {found} bytes, the index says {expected}; build the store again"
     )]
     Size {
         /// The layer.
@@ -78,6 +82,28 @@ pub enum InspectError {
         centre: [u32; 2],
         /// Why not.
         error: DecodeError,
+    },
+    /// Triangles cannot be decoded.
+    #[error("layer {layer}: the triangles of diamond {centre:?}: {error}")]
+    Triangles {
+        /// The layer.
+        layer: String,
+        /// The diamond.
+        centre: [u32; 2],
+        /// Why not.
+        error: diamantina_protocol::tin::DecodeError,
+    },
+    /// Triangles do not fit their neighbours.
+    #[error(
+        "layer {layer}: the triangles of diamond {centre:?} do not fit their neighbours' along the line {line:?}; build the store again"
+    )]
+    Crack {
+        /// The layer.
+        layer: String,
+        /// The diamond.
+        centre: [u32; 2],
+        /// From where to where.
+        line: [[u32; 2]; 2],
     },
     /// The masks of a zone are missing or wrong.
     #[error("zone '{zone}': {what}; compute it again with --replace")]
@@ -131,6 +157,9 @@ pub struct LayerInspection {
     pub real_points: Option<u64>,
     /// See `real_points`.
     pub fictitious_points: Option<u64>,
+    /// The encoding `tin`, if the layer has it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tin: Option<TinInspection>,
 }
 
 /// The diamonds of a level in numbers.
@@ -157,12 +186,12 @@ pub struct LevelInspection {
 pub fn entries(store: &Store, number: u8, layer: &Layer) -> Result<HashMap<Diamond, Entry>, InspectError> {
     let mut all = HashMap::new();
     for page in 0..index::pages(&layer.forest) {
-        all.extend(read_page(store, number, layer, page)?);
+        all.extend(read_page(store, number, layer, Kind::Index, page)?);
     }
     Ok(all)
 }
 
-/// One page of a layer's index.
+/// One page of a layer's index: of points, or of triangles ([`Kind::TinIndex`]).
 ///
 /// # Errors
 /// When it is missing or damaged.
@@ -170,14 +199,17 @@ pub fn read_page(
     store: &Store,
     number: u8,
     layer: &Layer,
+    kind: Kind,
     page: u32,
 ) -> Result<Vec<(Diamond, Entry)>, InspectError> {
     let name = || layer.name.clone();
-    let key = Key { layer: number, kind: Kind::Index, a: page, b: 0 };
+    let forest =
+        layer.tin.as_ref().filter(|_| kind == Kind::TinIndex).map_or(&layer.forest, |tin| &tin.forest);
+    let key = Key { layer: number, kind, a: page, b: 0 };
     let blob = store.get(key)?.ok_or_else(|| InspectError::NoPage { layer: name(), page })?;
     let bytes = zstd::bulk::decompress(&blob, 4 * index::PAGE_BYTES_MAX)
         .map_err(|error| InspectError::Compression { layer: name(), page, error })?;
-    index::decode(&layer.forest, page, &bytes).map_err(|error| InspectError::Page { layer: name(), error })
+    index::decode(forest, page, &bytes).map_err(|error| InspectError::Page { layer: name(), error })
 }
 
 /// Reads the index of a store and, with `verify`, every blob: checksums, sizes, and that each payload
@@ -189,41 +221,50 @@ pub fn inspect(store: &Store, verify: bool) -> Result<Inspection, InspectError> 
     let mut layers = Vec::new();
     for (number, layer) in store.scene().layers.iter().enumerate() {
         let number = u8::try_from(number).unwrap_or(u8::MAX);
-        let entries = entries(store, number, layer)?;
-        let mut index_bytes = 0;
-        let mut strays = 0;
-        for (key, bytes) in store.keys().filter(|(key, _)| key.layer == number) {
-            match key.kind {
-                Kind::Index => index_bytes += u64::from(bytes),
-                Kind::Zone => {}
-                Kind::Points => {
-                    let known = layer.forest.diamond([key.a, key.b]).and_then(|d| entries.get(&d));
-                    match known {
-                        Some(e) if e.bytes == bytes => {}
-                        Some(e) => {
-                            let (layer, centre) = (layer.name.clone(), [key.a, key.b]);
-                            return Err(InspectError::Size {
-                                layer,
-                                centre,
-                                found: bytes,
-                                expected: e.bytes,
-                            });
-                        }
-                        None => strays += 1,
-                    }
-                }
-            }
-        }
-        if strays > 0 {
-            return Err(InspectError::Strays { layer: layer.name.clone(), count: strays });
-        }
-        let tally = if verify { Some(verify_layer(store, number, layer, &entries)?) } else { None };
-        layers.push(summary(layer, &entries, index_bytes, tally));
+        let has_points = layer.encodings.iter().any(|e| e == "points");
+        let entries = if has_points { entries(store, number, layer)? } else { HashMap::new() };
+        let index_bytes = sizes(store, number, layer, &entries)?;
+        let tally =
+            if verify && has_points { Some(verify_layer(store, number, layer, &entries)?) } else { None };
+        let triangles =
+            layer.tin.as_ref().map(|tin| tin::inspect(store, number, layer, tin, verify)).transpose()?;
+        layers.push(LayerInspection { tin: triangles, ..summary(layer, &entries, index_bytes, tally) });
     }
     for position in 0..if verify { store.scene().zones.len() } else { 0 } {
         masks(store, position)?;
     }
     Ok(Inspection { scene: store.scene().clone(), layers, verified: verify })
+}
+
+/// Compares the sizes of a layer's points with its index; the bytes of the pages.
+fn sizes(
+    store: &Store,
+    number: u8,
+    layer: &Layer,
+    entries: &HashMap<Diamond, Entry>,
+) -> Result<u64, InspectError> {
+    let (mut index_bytes, mut strays) = (0, 0);
+    for (key, found) in store.keys().filter(|(key, _)| key.layer == number) {
+        match key.kind {
+            Kind::Index => index_bytes += u64::from(found),
+            Kind::Points => {
+                let centre = [key.a, key.b];
+                match layer.forest.diamond(centre).and_then(|d| entries.get(&d)) {
+                    Some(e) if e.bytes == found => {}
+                    Some(e) => {
+                        let (layer, expected) = (layer.name.clone(), e.bytes);
+                        return Err(InspectError::Size { layer, centre, found, expected });
+                    }
+                    None => strays += 1,
+                }
+            }
+            Kind::Zone | Kind::Tin | Kind::TinIndex => {}
+        }
+    }
+    if strays > 0 {
+        return Err(InspectError::Strays { layer: layer.name.clone(), count: strays });
+    }
+    Ok(index_bytes)
 }
 
 /// The masks of the zone at a position in the scene, one a layer.
@@ -277,6 +318,7 @@ fn summary(
         errors: layer.errors.clone(),
         real_points: tally.map(|t| t.0),
         fictitious_points: tally.map(|t| t.1),
+        tin: None,
     }
 }
 

@@ -17,4 +17,5 @@ pub mod projection;
 pub mod sample;
 pub mod store;
 pub mod stream;
+pub mod tin;
 pub mod zone;

@@ -1,14 +1,15 @@
 //! The command line of the server.
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use diamantina_protocol::message::{Kind, is_name};
+use diamantina_protocol::message::{Kind, Layer, is_name};
 use diamantina_protocol::points::Rule;
 use diamantina_server::experiment::ExperimentError;
-use diamantina_server::hierarchy::{self, BuildError, Estimate, Report};
+use diamantina_server::hierarchy::{self, BuildError, Estimate, Report, TinOptions};
 use diamantina_server::ingest::IngestError;
-use diamantina_server::inspect::{self, Inspection};
+use diamantina_server::inspect::{self, Inspection, TinInspection};
 use diamantina_server::progress::Progress;
 use diamantina_server::store::{Store, StoreError};
+use diamantina_server::tin::Metric;
 use diamantina_server::zone::polygon::Coordinates;
 use diamantina_server::zone::{self, ZoneError};
 use diamantina_server::{curve, demo, experiment, http, ingest};
@@ -67,6 +68,19 @@ struct BuildArgs {
     /// Encodings to build
     #[arg(long, default_value = "points", value_enum, value_delimiter = ',')]
     encoding: Vec<Encoding>,
+    /// tin: triangles of a patch at which simplification stops, but for the finest: these keep --max-error
+    #[arg(long, default_value_t = hierarchy::PATCH_TRIANGLES, value_name = "N")]
+    patch_triangles: u32,
+    /// tin: the order of collapses
+    #[arg(long, default_value = "normal", value_enum)]
+    metric: MetricName,
+    /// tin: how much borders along nodata count in that order
+    #[arg(long, default_value_t = hierarchy::LAMBDA, value_name = "WEIGHT", allow_negative_numbers = true)]
+    lambda: f64,
+    /// tin: stop at this error instead of a count, in metres: of the finest patches that are simplified, twice as much
+    /// every two levels
+    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
+    patch_error: Option<f64>,
     /// How the receiver deduces the height of a fictitious point
     #[arg(long, default_value = "smooth", value_enum)]
     rule: RuleName,
@@ -95,9 +109,20 @@ struct BuildArgs {
     json: bool,
 }
 
-#[derive(Clone, Copy, ValueEnum)]
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Encoding {
+    /// Progressive points: the fewest bytes
     Points,
+    /// Irregular triangles: the fewest triangles
+    Tin,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum MetricName {
+    /// How much normals change
+    Normal,
+    /// Squared distances to planes
+    Quadric,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -350,6 +375,16 @@ fn build(args: BuildArgs) -> Result<(), Failure> {
             "128" => 7,
             _ => 6,
         },
+        points: args.encoding.contains(&Encoding::Points),
+        tin: args.encoding.contains(&Encoding::Tin).then_some(TinOptions {
+            patch_triangles: args.patch_triangles,
+            metric: match args.metric {
+                MetricName::Normal => Metric::Normal,
+                MetricName::Quadric => Metric::Quadric,
+            },
+            lambda: args.lambda,
+            patch_error: args.patch_error,
+        }),
         memory: args.memory,
         fresh: args.fresh,
         checkpoint: Duration::from_secs(args.checkpoint),
@@ -421,6 +456,7 @@ fn refuse_build(sources: &[PathBuf], error: &BuildError) -> Failure {
         BuildError::MaxError { .. }
             | BuildError::Quantum(_)
             | BuildError::Memory { .. }
+            | BuildError::TinOption { .. }
             | BuildError::Store(StoreError::Foreign { .. })
             | BuildError::Ingest(IngestError::Options { .. })
     );
@@ -476,11 +512,24 @@ fn print_report(out: &mut impl Write, store: &Path, report: &Report) -> std::io:
         layer.heights[1],
         100.0 * (1.0 - layer.valid_samples as f64 / report.samples as f64),
     )?;
-    writeln!(
-        out,
-        "  {} diamonds, {} bytes of points ({:.3} bits a sample), {} bytes of index, finest error {} m",
-        report.diamonds, report.point_bytes, report.bits_per_sample, report.index_bytes, layer.finest_error,
-    )?;
+    if report.diamonds > 0 || layer.tin.is_none() {
+        writeln!(
+            out,
+            "  {} diamonds, {} bytes of points ({:.3} bits a sample), {} bytes of index, finest error {} m",
+            report.diamonds,
+            report.point_bytes,
+            report.bits_per_sample,
+            report.index_bytes,
+            layer.finest_error,
+        )?;
+    }
+    if let Some(tin) = &layer.tin {
+        writeln!(
+            out,
+            "  {} triangles, {} bytes with their index, finest error {} m",
+            tin.triangles, tin.bytes, tin.finest_error
+        )?;
+    }
     writeln!(out, "  {:.1} s, {:.2} Msamples/s", report.seconds, report.msamples_per_second)?;
     writeln!(out, "Next: diamantina-server serve {}", store.display())
 }
@@ -530,6 +579,12 @@ fn print_inspection(out: &mut impl Write, i: &Inspection) -> std::io::Result<()>
             about.quantum,
             layer.errors
         )?;
+        if let Some(tin) = &layer.tin {
+            print_triangles(out, tin, about)?;
+        }
+        if !about.encodings.iter().any(|e| e == "points") {
+            continue;
+        }
         writeln!(out, "  level  diamonds        bytes     step [m]   error min [m]   error max [m]")?;
         for l in &layer.levels {
             writeln!(
@@ -564,6 +619,25 @@ fn print_inspection(out: &mut impl Write, i: &Inspection) -> std::io::Result<()>
         writeln!(out, "verified: every blob matches its checksum and decodes")?;
     }
     Ok(())
+}
+
+fn print_triangles(out: &mut impl Write, i: &TinInspection, about: &Layer) -> std::io::Result<()> {
+    writeln!(out, "  level  diamonds        bytes    triangles   error min [m]   error max [m]   (tin)")?;
+    for l in &i.levels {
+        // How many there are is known once they are decoded.
+        let triangles = l.triangles.map_or_else(|| "-".to_owned(), |n| n.to_string());
+        writeln!(
+            out,
+            "  {:>5} {:>9} {:>12} {triangles:>12} {:>15} {:>15}",
+            l.level, l.diamonds, l.bytes, l.error_min, l.error_max
+        )?;
+    }
+    writeln!(out, "  finest error {} m (asked: {} m), errors {}", i.finest_error, about.max_error, i.errors)?;
+    writeln!(
+        out,
+        "  {} triangles in {} bytes, {:.3} bits each; {} bytes of index",
+        i.triangles, i.bytes, i.bits_per_triangle, i.index_bytes
+    )
 }
 
 fn compute_zone(args: ZoneArgs) -> Result<(), Failure> {

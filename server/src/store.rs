@@ -84,6 +84,10 @@ pub enum Kind {
     Index,
     /// The points of a diamond.
     Points,
+    /// The triangles of a diamond.
+    Tin,
+    /// A page of the index of triangles, zstd-compressed.
+    TinIndex,
     /// A zone's masks, zstd-compressed; the key has layer 255 and the zone's position in the scene.
     Zone,
 }
@@ -243,6 +247,8 @@ fn kind_code(kind: Kind) -> u8 {
     match kind {
         Kind::Index => 1,
         Kind::Points => 2,
+        Kind::Tin => 3,
+        Kind::TinIndex => 4,
         Kind::Zone => 16,
     }
 }
@@ -277,6 +283,8 @@ fn read_directory(bytes: &[u8], pack_bytes: &[u64]) -> Result<Vec<(Key, Place)>,
         let kind = match e[1] {
             1 => Kind::Index,
             2 => Kind::Points,
+            3 => Kind::Tin,
+            4 => Kind::TinIndex,
             16 => Kind::Zone,
             other => return Err(format!("directory has a blob of kind {other}")),
         };

@@ -279,7 +279,7 @@ impl Pages {
             {
                 self.held.remove(&idle);
             }
-            let mut entries = read_page(&self.store, self.number, &self.layer, page)?;
+            let mut entries = read_page(&self.store, self.number, &self.layer, Kind::Index, page)?;
             entries.sort_unstable_by_key(|(d, _)| *d);
             self.held.insert(page, (self.now, entries));
             if self.seen.insert(page) {

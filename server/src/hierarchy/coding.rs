@@ -34,6 +34,13 @@ pub(super) fn fine_step(max_error: f64, stats: &Stats) -> Result<u32, BuildError
 /// less than 0.1 %; with 8 a store is 1 % larger, where steps are large 7 %.
 const MODEL_SAMPLES: usize = 24;
 
+/// How a layer without points would be coded: nothing is measured or learnt for it.
+pub(super) fn without_points(plan: &Plan, rule: Rule, fine_step: u32) -> Result<(Plan, Coding), BuildError> {
+    let plan = plan.with_precision(0);
+    let exponents = vec![0; plan.forest.lattice_levels() as usize + 1];
+    Ok((plan, Coding::new(rule, fine_step, exponents)?))
+}
+
 /// How the layer is coded: its steps, and a model learnt from a spread of its diamonds; and the plan with as
 /// many levels past the finest lattice as these steps ask for.
 pub(super) fn coding(

@@ -4,7 +4,9 @@ use super::transcribe::HEIGHT_METRES_MAX;
 use crate::ingest::IngestError;
 use crate::store::StoreError;
 use diamantina_protocol::bintree::ForestError;
+use diamantina_protocol::message::PAYLOAD_BYTES_MAX;
 use diamantina_protocol::points::{CodingError, SOURCE_MAX};
+use diamantina_protocol::tin::PatchError;
 use std::io;
 use std::path::PathBuf;
 
@@ -72,6 +74,39 @@ pub enum BuildError {
         height: u32,
         /// Why not.
         error: ForestError,
+    },
+    /// Patches of triangles do not fit.
+    #[error("the forest of triangles: {0}; give another --patch-triangles, or build points alone")]
+    TinForest(ForestError),
+    /// An option of triangles is out of range.
+    #[error("{name} {found}: expected {expected}")]
+    TinOption {
+        /// The option.
+        name: &'static str,
+        /// The value.
+        found: f64,
+        /// What it may be.
+        expected: &'static str,
+    },
+    /// A patch is larger than the format allows.
+    #[error(
+        "the triangles of diamond {centre:?}: {error}; give a larger --patch-error, or --patch-triangles instead of it"
+    )]
+    Patch {
+        /// The diamond.
+        centre: [u32; 2],
+        /// Why it cannot be coded.
+        error: PatchError,
+    },
+    /// A patch takes more bytes than a client reads.
+    #[error(
+        "the triangles of diamond {centre:?} take {bytes} bytes, limit {PAYLOAD_BYTES_MAX}; give a smaller --patch-triangles or a larger --quantum"
+    )]
+    Payload {
+        /// The diamond.
+        centre: [u32; 2],
+        /// Bytes.
+        bytes: usize,
     },
     /// Our own steps were refused.
     #[error("steps: {0}")]

@@ -93,7 +93,7 @@ struct Tile {
 pub fn estimate(source: &Source, options: &Options) -> Result<Estimate, BuildError> {
     let grid = source.grid();
     let forest = forest_of(grid, options)?;
-    let plan = Plan::new(forest, options.memory)?;
+    let plan = Plan::new(forest, options.memory, 0)?;
     let quantum = find_quantum(source, options)?;
     let started = Instant::now();
     let side = 1u32 << (options.patch_log2 + TILE_LOG2);
@@ -256,7 +256,7 @@ fn build_tile(tile: &Tile, grid: &Grid, options: &Options) -> Result<Built, Buil
     let grid = Grid { width, height, ..grid.clone() };
     let forest = Forest::new(options.patch_log2 + TILE_LOG2, options.patch_log2, [1, 1])
         .map_err(|error| BuildError::Forest { width, height, error })?;
-    let plan = Plan::new(forest, u64::MAX / 2)?;
+    let plan = Plan::new(forest, u64::MAX / 2, 0)?;
     let canvas = Canvas::create(writer.work_folder(), width, height, plan.coarsest()).map_err(&failed)?;
     canvas.write_rows(0, &tile.heights).map_err(&failed)?;
     let fine_step = fine_step(options.max_error, &tile.stats)?;

@@ -3,6 +3,7 @@
 #![allow(clippy::cast_possible_truncation, reason = "metres are rounded to f32 on purpose")]
 
 use super::tallies::{PerDiamond, Tallies, Tally};
+use super::tins::BEHIND;
 use super::transcribe::Stats;
 use super::{Build, BuildError, Options};
 use crate::store::{Key, Kind as BlobKind};
@@ -18,7 +19,7 @@ pub(super) struct Sums {
     pub(super) diamonds: u64,
     /// Bytes of payloads.
     pub(super) point_bytes: u64,
-    /// Bytes of pages.
+    /// Bytes of pages, of all encodings.
     pub(super) index_bytes: u64,
 }
 
@@ -38,14 +39,19 @@ impl Build<'_> {
         let written = tallies.of.values().filter(|t| t.bytes > 0);
         let (diamonds, point_bytes) =
             written.fold((0, 0), |(n, sum): (u64, u64), t| (n + 1, sum + u64::from(t.bytes)));
-        let metres = |level: u32, tally: Tally| {
+        let entry = |level: u32, tally: Tally| {
             let own = tally.vertical * stats.quantum + stats.rounding;
             let apart = if tally.outline { forest.hypotenuse(level, cell) } else { 0.0 };
             let compared = tally.vertical > 0.0 || tally.outline;
-            if compared { up((own + apart) * slack) } else { 0.0 }
+            let error_metres = if compared { up((own + apart) * slack) } else { 0.0 };
+            let entry = Entry { bytes: tally.bytes, error_metres, ..Entry::EMPTY };
+            if tally.low <= tally.high { Entry { low: tally.low, high: tally.high, ..entry } } else { entry }
         };
-        let entries = saturated(forest, tallies.of, finest, metres);
-        let index_bytes = self.pages(&entries)?;
+        let index_bytes = if options.points {
+            self.pages(forest, &saturated(forest, tallies.of, finest, entry), BlobKind::Index)?
+        } else {
+            0
+        };
         let offset = self.grid.height_offset;
         let layer = Layer {
             name: options.layer.clone(),
@@ -63,7 +69,7 @@ impl Build<'_> {
             ],
             max_error: options.max_error,
             finest_error: finest,
-            encodings: vec!["points".to_owned()],
+            encodings: if options.points { vec!["points".to_owned()] } else { Vec::new() },
             coding: self.coding.clone(),
             bytes: point_bytes + index_bytes,
             resampled: self.grid.resampled,
@@ -73,12 +79,17 @@ impl Build<'_> {
         Ok((layer, Sums { diamonds, point_bytes, index_bytes }))
     }
 
-    /// Writes the pages; their bytes.
-    fn pages(&self, entries: &PerDiamond<Entry>) -> Result<u64, BuildError> {
-        let forest = &self.plan.forest;
+    /// Writes the pages of an index; their bytes.
+    pub(super) fn pages(
+        &self,
+        forest: &Forest,
+        entries: &PerDiamond<Entry>,
+        kind: BlobKind,
+    ) -> Result<u64, BuildError> {
         let pages = index::pages(forest);
         let progress = self.work.progress;
         progress.stage("index", "pages", pages.into(), 0);
+        let behind = if kind == BlobKind::TinIndex { BEHIND } else { 0 };
         let page = |page: u32| {
             if progress.is_stopping() {
                 return Err(self.interrupted());
@@ -86,8 +97,8 @@ impl Build<'_> {
             let diamonds = index::page_diamonds(forest, page).unwrap_or_default();
             let list: Vec<Entry> = diamonds.iter().map(|d| entries.get(*d)).collect();
             let blob = zstd::bulk::compress(&index::encode(&list), 12).map_err(self.work.failure())?;
-            let key = Key { layer: 0, kind: BlobKind::Index, a: page, b: 0 };
-            self.work.writer.put(key, u64::from(page), &blob)?;
+            let key = Key { layer: 0, kind, a: page, b: 0 };
+            self.work.writer.put(key, behind | u64::from(page), &blob)?;
             progress.advance(1);
             Ok(blob.len() as u64)
         };
@@ -95,21 +106,18 @@ impl Build<'_> {
     }
 }
 
-/// What the index says of each diamond: parents declare at least what their children do.
-fn saturated(
+/// What the index says of each diamond, given what is known of it alone: parents declare at least what their children
+/// do.
+pub(super) fn saturated<T: Copy>(
     forest: &Forest,
-    mut tallies: PerDiamond<Tally>,
+    mut known: PerDiamond<T>,
     finest: f32,
-    metres: impl Fn(u32, Tally) -> f32,
+    own: impl Fn(u32, T) -> Entry,
 ) -> PerDiamond<Entry> {
     let mut entries = PerDiamond::new(*forest, Entry::EMPTY);
     for level in (0..forest.levels()).rev() {
         for d in forest.diamonds(level) {
-            let tally = tallies.get(d);
-            let mut entry = Entry { bytes: tally.bytes, error_metres: metres(level, tally), ..Entry::EMPTY };
-            if tally.low <= tally.high {
-                (entry.low, entry.high) = (tally.low, tally.high);
-            }
+            let mut entry = own(level, known.get(d));
             for child in forest.children(d).into_iter().flatten().map(|c| entries.get(c)) {
                 if !child.is_empty() {
                     entry.error_metres = entry.error_metres.max(child.error_metres);
@@ -123,13 +131,13 @@ fn saturated(
             }
             *entries.at(d) = entry;
         }
-        tallies.forget(level);
+        known.forget(level);
     }
     entries
 }
 
 /// The least `f32` at or above a value.
-fn up(value: f64) -> f32 {
+pub(super) fn up(value: f64) -> f32 {
     let near = value as f32;
     if f64::from(near) < value { near.next_up() } else { near }
 }

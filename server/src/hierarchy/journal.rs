@@ -1,7 +1,8 @@
 //! What of a build is done, on disk, so that a killed one goes on where it ended.
 //!
 //! The journal lies in the work folder and only grows. It opens with a fingerprint of the source and of
-//! the options that matter; each record behind it is a finished band of the canvas or a finished chunk.
+//! the options that matter; each record behind it is a finished band of the canvas, a finished chunk, or a finished
+//! tile of a level of triangles.
 //! A record is written only once what it speaks of is on the disk, so whatever can be read back is true.
 //! A torn or damaged record ends the journal: it and what follows is done again.
 //!
@@ -18,8 +19,9 @@
 //! |---|---|---|---|
 //! | 0 | 4 | bytes of content | at most 2^28 |
 //! | 4 | 8 | XXH3 of the content | |
-//! | 12 | .. | content: 1 and a [`Band`], or 2 and a [`Chunk`], fields in order, little-endian | |
+//! | 12 | .. | content: 1 and a [`Band`], 2 and a [`Chunk`], or 3 and a [`Tile`], fields in order, little-endian | |
 
+use super::tins::Place;
 use crate::measure::Found;
 use crate::store::Spot;
 use std::fs::File;
@@ -72,6 +74,36 @@ pub(super) struct Chunk {
     pub(super) found: Vec<([u32; 2], Found)>,
 }
 
+/// A diamond that has its triangles.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct Triangulated {
+    pub(super) centre: [u32; 2],
+    pub(super) low: i32,
+    pub(super) high: i32,
+    /// Of its payload.
+    pub(super) triangles: u32,
+    /// Where its payload is, if it has one.
+    pub(super) spot: Option<Spot>,
+    /// The largest distance between the samples and its halves, in quanta.
+    pub(super) vertical: f64,
+    /// The largest distance between borders, in metres.
+    pub(super) apart: f64,
+    /// Where its halves are.
+    pub(super) halves: Place,
+}
+
+/// A tile of a level of triangles that is done.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(super) struct Tile {
+    pub(super) level: u32,
+    /// Its position among the tiles of its level.
+    pub(super) number: u32,
+    /// Of what is drawn where all is split: the largest vertical distance, in quanta, and between borders, in metres.
+    pub(super) finest: [f64; 2],
+    /// Its diamonds.
+    pub(super) done: Vec<Triangulated>,
+}
+
 /// What a journal says.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Record {
@@ -79,6 +111,8 @@ pub(super) enum Record {
     Band(Band),
     /// A chunk whose blobs are in the spool.
     Chunk(Chunk),
+    /// A tile whose blobs are in the spool, and halves in the file of its level.
+    Tile(Tile),
 }
 
 /// A journal being written.
@@ -255,6 +289,28 @@ fn content(record: &Record) -> Vec<u8> {
                 out.push(found.outline.into());
             }
         }
+        Record::Tile(tile) => {
+            out.reserve(29 + tile.done.len() * 72);
+            out.push(3);
+            out.extend(tile.level.to_le_bytes());
+            out.extend(tile.number.to_le_bytes());
+            out.extend(tile.finest.map(f64::to_le_bytes).as_flattened());
+            out.extend(u32::try_from(tile.done.len()).unwrap_or(u32::MAX).to_le_bytes());
+            for one in &tile.done {
+                let spot = one.spot.unwrap_or(Spot { offset: 0, bytes: 0, checksum: 0 });
+                out.extend(one.centre.map(u32::to_le_bytes).as_flattened());
+                out.extend(one.low.to_le_bytes());
+                out.extend(one.high.to_le_bytes());
+                out.extend(one.triangles.to_le_bytes());
+                out.extend(spot.bytes.to_le_bytes());
+                out.extend(spot.offset.to_le_bytes());
+                out.extend(spot.checksum.to_le_bytes());
+                out.extend(one.vertical.to_le_bytes());
+                out.extend(one.apart.to_le_bytes());
+                out.extend(one.halves.offset.to_le_bytes());
+                out.extend(one.halves.bytes.map(u32::to_le_bytes).as_flattened());
+            }
+        }
     }
     out
 }
@@ -311,6 +367,19 @@ fn parse(content: &[u8]) -> Option<Record> {
             }
             Record::Chunk(chunk)
         }
+        3 => {
+            let mut tile =
+                Tile { level: f.u32()?, number: f.u32()?, finest: [f.f64()?, f.f64()?], done: vec![] };
+            for _ in 0..f.u32()? {
+                let (centre, low, high, triangles) = (f.centre()?, f.i32()?, f.i32()?, f.u32()?);
+                let (bytes, offset, checksum) = (f.u32()?, f.u64()?, f.u64()?);
+                let spot = (bytes > 0).then_some(Spot { offset, bytes, checksum });
+                let (vertical, apart) = (f.f64()?, f.f64()?);
+                let halves = Place { offset: f.u64()?, bytes: f.centre()? };
+                tile.done.push(Triangulated { centre, low, high, triangles, spot, vertical, apart, halves });
+            }
+            Record::Tile(tile)
+        }
         _ => return None,
     };
     f.0.is_empty().then_some(record)
@@ -336,6 +405,24 @@ mod tests {
                 found: vec![([64, 192], Found { vertical: 12.25, outline: true })],
             }),
             Record::Band(Band { y0: 256, rows: 1, low: 0, high: 0, valid: 0, rounding: 0.0 }),
+            Record::Tile(Tile {
+                level: 7,
+                number: 2,
+                finest: [0.25, 30.0],
+                done: vec![
+                    Triangulated {
+                        centre: [32, 96],
+                        low: -3,
+                        high: 8,
+                        triangles: 77,
+                        spot,
+                        vertical: 1.5,
+                        apart: 42.0,
+                        halves: Place { offset: 1 << 41, bytes: [5, 0] },
+                    },
+                    Triangulated { centre: [0, 32], ..Triangulated::default() },
+                ],
+            }),
         ]
     }
 
@@ -370,7 +457,7 @@ mod tests {
         let journal = journal.unwrap().unwrap();
         journal.note(&records()[0]);
         journal.checkpoint(|| Ok(()), |e: io::Error| e).unwrap();
-        assert_eq!(read(folder.path()).unwrap().len(), 4);
+        assert_eq!(read(folder.path()).unwrap().len(), 5);
     }
 
     #[test]

@@ -23,16 +23,18 @@ mod levels;
 mod plan;
 mod surface;
 mod tallies;
+mod tins;
 mod transcribe;
 mod work;
 
 use crate::canvas::Canvas;
 use crate::ingest::{Grid, Source};
 use crate::progress::Progress;
-use crate::store::Writer;
+use crate::store::{Kind as BlobKind, Writer};
 use coding::fine_step;
 use diamantina_protocol::bintree::Forest;
-use diamantina_protocol::message::{Crs, Frame, Kind, Scene};
+use diamantina_protocol::index::Entry;
+use diamantina_protocol::message::{Crs, Frame, Kind, Layer, Scene, TinLayer};
 use diamantina_protocol::points::{Coding, Rule};
 use index::Sums;
 use plan::Plan;
@@ -41,12 +43,13 @@ use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
-use tallies::Tallies;
+use tallies::{PerDiamond, Tallies};
 use transcribe::{Stats, find_quantum, transcribe};
 use work::Work;
 
 pub use error::BuildError;
 pub use estimate::{Estimate, estimate};
+pub use tins::{LAMBDA, PATCH_TRIANGLES, PATCH_TRIANGLES_RANGE, TinOptions};
 
 /// What a build may be told.
 #[derive(Debug, Clone)]
@@ -65,6 +68,10 @@ pub struct Options {
     pub quantum: Option<f64>,
     /// Segments along the side of a patch, as a base-2 logarithm: 5, 6 or 7.
     pub patch_log2: u8,
+    /// Whether to build the encoding `points`.
+    pub points: bool,
+    /// How to build the encoding `tin`, if it is wanted.
+    pub tin: Option<TinOptions>,
     /// The most memory that the build may take, in bytes.
     pub memory: u64,
     /// Whether to begin anew even where an interrupted build could be gone on with.
@@ -85,6 +92,8 @@ impl Options {
             rule: Rule::Smooth,
             quantum: None,
             patch_log2: 6,
+            points: true,
+            tin: None,
             memory: 2 << 30,
             fresh: false,
             checkpoint: CHECKPOINT,
@@ -106,7 +115,7 @@ pub struct Report {
     pub diamonds: u64,
     /// Bytes of payloads.
     pub point_bytes: u64,
-    /// Bytes of index pages.
+    /// Bytes of index pages, of all encodings.
     pub index_bytes: u64,
     /// Bits of payload for each sample of the source that has a height.
     pub bits_per_sample: f64,
@@ -135,7 +144,8 @@ pub fn build(
     let grid = source.grid();
     let forest = forest_of(grid, options)?;
     // Wrong use is refused before an earlier run's work is touched.
-    let plan = Plan::new(forest, options.memory)?;
+    tins::check(options)?;
+    let plan = Plan::new(forest, options.memory, tins::bytes(&forest, options)?)?;
     let quantum = find_quantum(source, options)?;
     let writer = Writer::create(out)?;
     let built = run(source, &writer, options, progress, plan, quantum);
@@ -174,22 +184,32 @@ fn run(
     let (work, canvas, before) = work::open(writer, &plan, grid, &fingerprint, options, progress)?;
     let stats = transcribe(source, &plan, &canvas, quantum, &before.bands, &work)?;
     let fine_step = fine_step(options.max_error, &stats)?;
-    let (plan, coding) = coding::coding(&plan, &canvas, options.rule, fine_step)?;
+    let done = AtomicU64::new(before.done());
+    let (plan, coding) = if options.points {
+        coding::coding(&plan, &canvas, options.rule, fine_step)?
+    } else {
+        coding::without_points(&plan, options.rule, fine_step)?
+    };
     let build = Build {
         plan,
         canvas,
         coding,
         work: &work,
         tallies: Mutex::new(before.tallies),
-        done: AtomicU64::new(before.chunks.len() as u64),
+        done,
         before: before.chunks,
         grid,
     };
-    let coarse = build.coarse_levels()?;
-    build.chunks(&coarse)?;
-    drop(coarse);
+    if options.points {
+        let coarse = build.coarse_levels()?;
+        build.chunks(&coarse)?;
+    }
     let tallies = build.tallies.lock().unwrap_or_else(PoisonError::into_inner).take();
-    let (layer, sums) = build.index(tallies, options, &stats)?;
+    let triangles = build.triangles(before.tins, options, &stats)?;
+    let (mut layer, mut sums) = build.index(tallies, options, &stats)?;
+    if let Some((tin, entries)) = triangles {
+        build.index_triangles(&mut layer, &mut sums, tin, &entries)?;
+    }
     progress.stage("publish", "bytes", layer.bytes, 0);
     let scene = Scene {
         name: options.scene.clone(),
@@ -248,6 +268,50 @@ struct Build<'a> {
 }
 
 impl Build<'_> {
+    /// The layer's triangles, if they are wanted: what the scene says of them, and the index.
+    fn triangles(
+        &self,
+        before: Option<(Forest, tins::Found)>,
+        options: &Options,
+        stats: &Stats,
+    ) -> Result<Option<(TinLayer, PerDiamond<Entry>)>, BuildError> {
+        let Some(((forest, found), tin)) = before.zip(options.tin) else { return Ok(None) };
+        let tins = tins::Tins {
+            forest,
+            canvas: &self.canvas,
+            work: self.work,
+            options: tin,
+            stats,
+            max_error: options.max_error,
+            cell: self.grid.cell,
+            workers: tins::workers(options.memory),
+            memory: options.memory,
+            done: &self.done,
+        };
+        let found = tins.run(found)?;
+        Ok(Some(tins.describe(found)))
+    }
+
+    /// Writes the index of the triangles, and says of the layer that it has them.
+    fn index_triangles(
+        &self,
+        layer: &mut Layer,
+        sums: &mut Sums,
+        mut tin: TinLayer,
+        entries: &PerDiamond<Entry>,
+    ) -> Result<(), BuildError> {
+        let index_bytes = self.pages(&tin.forest, entries, BlobKind::TinIndex)?;
+        tin.bytes += index_bytes;
+        sums.index_bytes += index_bytes;
+        if layer.encodings.is_empty() {
+            layer.finest_error = tin.finest_error;
+        }
+        layer.bytes += tin.bytes;
+        layer.encodings.push("tin".to_owned());
+        layer.tin = Some(tin);
+        Ok(())
+    }
+
     fn interrupted(&self) -> BuildError {
         BuildError::Interrupted { done: self.done.load(Ordering::Relaxed), chunks: self.work.chunks }
     }

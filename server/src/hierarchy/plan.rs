@@ -49,7 +49,9 @@ pub(super) struct Plan {
 
 impl Plan {
     /// For a forest that may yet get levels past its finest lattice: there is room for as many as there can be.
-    pub(super) fn new(forest: Forest, memory: u64) -> Result<Self, BuildError> {
+    /// `aside` is the memory that is not to be used, of all that is granted.
+    pub(super) fn new(forest: Forest, granted: u64, aside: u64) -> Result<Self, BuildError> {
+        let memory = granted.saturating_sub(aside);
         let forest = widest(forest);
         let [w, h] = forest.size().map(u64::from);
         let threads = rayon::current_num_threads() as u64;
@@ -69,7 +71,7 @@ impl Plan {
         };
         let Some(least_log2) = chunk_logs.clone().find(|log2| needed(*log2) <= memory) else {
             let least = chunk_logs.map(needed).min().unwrap_or(u64::MAX);
-            return Err(BuildError::Memory { asked: memory, needed: least });
+            return Err(BuildError::Memory { asked: granted, needed: least.saturating_add(aside) });
         };
         // Larger ones compute less twice, along their borders: two fifths more at 1024 cells, a fifth at 2048. As
         // long as there are enough to keep all cores busy. Cores and not threads: a build may be gone on with by
@@ -132,7 +134,7 @@ mod tests {
     fn ten_thousand_million_samples_fit_the_memory_that_is_granted_by_default() {
         let forest = Forest::covering(100_000, 100_000, 6).unwrap();
         let granted = 2 << 30;
-        let plan = Plan::new(forest, granted).unwrap();
+        let plan = Plan::new(forest, granted, 0).unwrap();
         assert!(plan.memory <= granted, "{} bytes", plan.memory);
         assert_eq!(plan.workers, rayon::current_num_threads().min(2), "two cores have work");
     }

@@ -1,0 +1,276 @@
+//! The mesh of a triangle of the bintree; four of them merged, simplified, and cut in two.
+
+use super::collapse::{Passed, Simplifier, Square, Until, distance_to};
+use super::ground::Ground;
+use super::mesh::{Mesh, NONE};
+use super::metric::{between, length, turn};
+use super::{Rules, Vertex};
+use diamantina_protocol::NODATA;
+use diamantina_protocol::bintree::Forest;
+use diamantina_protocol::diamond::Diamond;
+use diamantina_protocol::tin::Patch;
+use std::collections::{HashMap, HashSet};
+
+/// An edge of the border, from vertex to vertex, and the points of the source's border that it stands for, but for those
+/// on a straight line between others. It has the mesh to its left.
+pub type Border = ([u32; 2], Vec<[u32; 2]>);
+
+/// The mesh of one triangle of the bintree. Takes 24 bytes a triangle, and 8 for each point that its borders stand for.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Tin {
+    /// In no order; some of the same place where triangles touch in a point alone.
+    pub vertices: Vec<Vertex>,
+    /// Counterclockwise in plan.
+    pub triangles: Vec<[u32; 3]>,
+    /// Those borders along nodata that are not the source's own.
+    pub borders: Vec<Border>,
+    /// How far what was left out since there was no room for it lies from what is there, in metres.
+    pub lost: f64,
+}
+
+/// The meshes of a diamond's four triangles as one.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Merged {
+    /// What lies on a side of two triangles is one vertex.
+    pub patch: Patch,
+    /// See [`Tin::borders`].
+    pub borders: Vec<Border>,
+    /// See [`Tin::lost`].
+    pub lost: f64,
+    /// Whether it is the source's own mesh.
+    is_source: bool,
+}
+
+/// What became of a diamond.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Simplified {
+    /// The meshes of its triangles below and above the hypotenuse.
+    pub halves: [Tin; 2],
+    /// The largest distance between their borders and the source's, in metres.
+    pub apart: f64,
+}
+
+/// A lattice point of the forest as a vertex.
+fn point([x, y]: [i64; 2]) -> Vertex {
+    let whole = |w: i64| u32::try_from(w).unwrap_or(0);
+    Vertex { x: whole(x), y: whole(y), height: 0 }
+}
+
+/// The corners of a diamond.
+fn square(forest: &Forest, d: Diamond) -> Square {
+    let local = forest.local(d);
+    let n = i64::try_from(forest.segments_at(d.level())).unwrap_or(0);
+    let corner = |u: i64, v: i64| point(local.lattice2([2 * n * u, 2 * n * v]));
+    Square { a: corner(0, 0), b: corner(1, 1), lower: corner(1, 0), upper: local.upper.then(|| corner(0, 1)) }
+}
+
+/// The half of a diamond that a parent of it gets: 0 is the one below its hypotenuse.
+#[must_use]
+pub fn half_of(forest: &Forest, child: Diamond, parent: Diamond) -> usize {
+    let lower = square(forest, child).lower;
+    usize::from([lower.x, lower.y] != parent.centre())
+}
+
+/// The source's own mesh of a diamond's square: all micro-triangles of the lattice whose corners have heights. For
+/// diamonds of an even level, and of an odd one at least two cells across.
+#[must_use]
+pub fn source(forest: &Forest, d: Diamond, ground: Ground<'_>) -> Merged {
+    let square = square(forest, d);
+    let [low, high] = forest.bounds(d);
+    let even = d.level().is_multiple_of(2);
+    let columns = (high[0] - low[0] + 1) as usize;
+    let mut numbers = vec![NONE; columns * (high[1] - low[1] + 1) as usize];
+    let mut merged = Merged { is_source: true, ..Merged::default() };
+    let inside = |corners: [[u32; 2]; 3]| {
+        // The sum of the three corners, against three times each side.
+        let (x, y) = (corners.iter().map(|c| c[0]).sum(), corners.iter().map(|c| c[1]).sum());
+        let thrice = |v: Vertex| Vertex { x: 3 * v.x, y: 3 * v.y, height: 0 };
+        let middle = Vertex { x, y, height: 0 };
+        square.contains(middle, thrice)
+    };
+    for y in low[1]..high[1] {
+        for x in low[0]..high[0] {
+            let [sw, se, ne, nw] = [[x, y], [x + 1, y], [x + 1, y + 1], [x, y + 1]];
+            let halves = if (x + y).is_multiple_of(2) {
+                [[sw, se, ne], [sw, ne, nw]]
+            } else {
+                [[sw, se, nw], [se, ne, nw]]
+            };
+            for corners in halves {
+                let heights = corners.map(|[x, y]| ground.at(x, y));
+                if heights.contains(&NODATA) || !(even || inside(corners)) {
+                    continue;
+                }
+                merged.patch.triangles.push(std::array::from_fn(|i| {
+                    let [x, y] = corners[i];
+                    let slot = &mut numbers[(y - low[1]) as usize * columns + (x - low[0]) as usize];
+                    if *slot == NONE {
+                        *slot = u32::try_from(merged.patch.vertices.len()).unwrap_or(NONE);
+                        merged.patch.vertices.push(Vertex { x, y, height: heights[i] });
+                    }
+                    *slot
+                }));
+            }
+        }
+    }
+    merged
+}
+
+/// Merges the meshes of the four triangles of a diamond's split, side by side as they are numbered.
+#[must_use]
+pub fn merge(forest: &Forest, d: Diamond, tins: [&Tin; 4]) -> Merged {
+    let square = square(forest, d);
+    let [x, y] = d.centre();
+    let centre = Vertex { x, y, height: 0 };
+    let mut merged = Merged::default();
+    merged.patch.vertices.reserve(tins.iter().map(|t| t.vertices.len()).sum());
+    merged.patch.triangles.reserve(tins.iter().map(|t| t.triangles.len()).sum());
+    let mut shared: HashMap<[u32; 2], u32> = HashMap::new();
+    for (i, tin) in tins.into_iter().enumerate() {
+        let numbers: Vec<u32> = tin
+            .vertices
+            .iter()
+            .map(|v| {
+                let next = u32::try_from(merged.patch.vertices.len()).unwrap_or(NONE);
+                // Two lines through the centre part the four.
+                let is_shared = turn(square.a, centre, *v) == 0 || turn(square.lower, centre, *v) == 0;
+                let number = if is_shared { *shared.entry([v.x, v.y]).or_insert(next) } else { next };
+                if number == next {
+                    merged.patch.vertices.push(*v);
+                }
+                number
+            })
+            .collect();
+        let renumber = |v: &u32| numbers[*v as usize];
+        merged.patch.triangles.extend(tin.triangles.iter().map(|t| t.each_ref().map(renumber)));
+        merged.patch.ends[i] = u32::try_from(merged.patch.triangles.len()).unwrap_or(NONE);
+        merged
+            .borders
+            .extend(tin.borders.iter().map(|(edge, points)| (edge.each_ref().map(renumber), points.clone())));
+    }
+    merged
+}
+
+/// Simplifies the mesh of a diamond and cuts it along the hypotenuse.
+#[must_use]
+pub fn simplify(forest: &Forest, d: Diamond, merged: &Merged, rules: &Rules, until: Until<'_>) -> Simplified {
+    if merged.patch.triangles.is_empty() {
+        return Simplified::default();
+    }
+    let square = square(forest, d);
+    let mesh = Mesh::new(&merged.patch.vertices, &merged.patch.triangles);
+    let passed = find_passed(&mesh, merged);
+    let mut simplifier = Simplifier::new(mesh, passed, merged.is_source, square, rules, until);
+    simplifier.run();
+    let Simplifier { mesh, passed, .. } = simplifier;
+    let point = |v: u32| mesh.points[v as usize];
+    let distance = |(h, points): (&u32, &Vec<[u32; 2]>)| {
+        let ends = [point(mesh.origin(*h)), point(mesh.target(*h))];
+        points.iter().map(|p| distance_to(&rules.scale, *p, ends)).fold(0.0, f64::max)
+    };
+    let apart = passed.iter().map(distance).fold(0.0, f64::max) + merged.lost;
+    let mut simplified = Simplified { halves: cut(&mesh, passed, &square), apart };
+    for half in &mut simplified.halves {
+        half.lost = merged.lost;
+        if half.triangles.len() > rules.triangles_max || half.vertices.len() > rules.vertices_max {
+            *half = with_room(half, rules);
+            // Wherever something was, something is no farther than the diamond is wide.
+            half.lost = length(between(&rules.scale, square.a, square.b));
+            simplified.apart = simplified.apart.max(half.lost);
+        }
+    }
+    simplified
+}
+
+/// The largest triangles of a half, as many as there may be. Only where nodata tears the ground to shreds can there be
+/// more that nothing but borders holds.
+fn with_room(half: &Tin, rules: &Rules) -> Tin {
+    let area = |t: &[u32; 3]| {
+        let [a, b, c] = t.map(|v| half.vertices[v as usize]);
+        turn(a, b, c)
+    };
+    let mut order: Vec<usize> = (0..half.triangles.len()).collect();
+    order.sort_by_key(|i| (std::cmp::Reverse(area(&half.triangles[*i])), *i));
+    let mut kept = Tin::default();
+    let mut numbers = vec![NONE; half.vertices.len()];
+    for i in order {
+        let t = half.triangles[i];
+        let fresh = t.iter().filter(|v| numbers[**v as usize] == NONE).count();
+        if kept.triangles.len() == rules.triangles_max || kept.vertices.len() + fresh > rules.vertices_max {
+            break;
+        }
+        kept.triangles.push(t.map(|v| {
+            let number = &mut numbers[v as usize];
+            if *number == NONE {
+                *number = u32::try_from(kept.vertices.len()).unwrap_or(NONE);
+                kept.vertices.push(half.vertices[v as usize]);
+            }
+            *number
+        }));
+    }
+    let edges: HashSet<[u32; 2]> =
+        kept.triangles.iter().flat_map(|t| (0..3).map(|i| [t[i], t[(i + 1) % 3]])).collect();
+    for (edge, points) in &half.borders {
+        let edge = edge.map(|v| numbers[v as usize]);
+        if edges.contains(&edge) {
+            kept.borders.push((edge, points.clone()));
+        }
+    }
+    kept
+}
+
+/// The half-edges of the borders that stand for more than themselves.
+fn find_passed(mesh: &Mesh, merged: &Merged) -> Passed {
+    let mut passed = Passed::new();
+    if merged.borders.is_empty() {
+        return passed;
+    }
+    // By place: where triangles touch in a point alone, the mesh has other numbers.
+    let place = |v: u32| [mesh.points[v as usize].x, mesh.points[v as usize].y];
+    let ends = |edge: [u32; 2]| {
+        edge.map(|v| [merged.patch.vertices[v as usize].x, merged.patch.vertices[v as usize].y])
+    };
+    let mut by_ends: HashMap<[[u32; 2]; 2], &Vec<[u32; 2]>> =
+        merged.borders.iter().map(|(edge, points)| (ends(*edge), points)).collect();
+    for h in mesh.borders() {
+        if let Some(points) = by_ends.remove(&[place(mesh.origin(h)), place(mesh.target(h))]) {
+            passed.insert(h, points.clone());
+        }
+    }
+    passed
+}
+
+/// Cuts a mesh along the hypotenuse.
+fn cut(mesh: &Mesh, mut passed: Passed, square: &Square) -> [Tin; 2] {
+    let mut halves = [Tin::default(), Tin::default()];
+    let mut numbers = [vec![NONE; mesh.points.len()], vec![NONE; mesh.points.len()]];
+    let side = |t: [u32; 3]| {
+        let turns = t.map(|v| turn(square.a, square.b, mesh.points[v as usize]));
+        usize::from(turns.into_iter().any(|turn| turn > 0))
+    };
+    for t in mesh.triangles() {
+        let i = side(t);
+        let (half, numbers) = (&mut halves[i], &mut numbers[i]);
+        half.triangles.push(t.map(|v| {
+            let number = &mut numbers[v as usize];
+            if *number == NONE {
+                *number = u32::try_from(half.vertices.len()).unwrap_or(NONE);
+                half.vertices.push(mesh.points[v as usize]);
+            }
+            *number
+        }));
+    }
+    if passed.is_empty() {
+        return halves;
+    }
+    for h in mesh.borders() {
+        if let Some(points) = passed.remove(&h) {
+            let first = h as usize / 3 * 3;
+            let i = side([mesh.origins[first], mesh.origins[first + 1], mesh.origins[first + 2]]);
+            halves[i]
+                .borders
+                .push(([mesh.origin(h), mesh.target(h)].map(|v| numbers[i][v as usize]), points));
+        }
+    }
+    halves
+}
