@@ -637,7 +637,12 @@ fn print_triangles(out: &mut impl Write, i: &TinInspection, about: &Layer) -> st
         out,
         "  {} triangles in {} bytes, {:.3} bits each; {} bytes of index",
         i.triangles, i.bytes, i.bits_per_triangle, i.index_bytes
-    )
+    )?;
+    if !i.cuts.is_empty() {
+        let cuts: Vec<String> = i.cuts.iter().map(|c| format!("{} m {}", c.error, c.triangles)).collect();
+        writeln!(out, "  triangles of the coarsest cut that keeps an error: {}", cuts.join(", "))?;
+    }
+    Ok(())
 }
 
 fn compute_zone(args: ZoneArgs) -> Result<(), Failure> {
