@@ -63,6 +63,8 @@ pub struct TinLevel {
     pub error_min: f32,
     /// The largest declared error, in metres.
     pub error_max: f32,
+    /// The largest distance of borders along nodata from the source's, in metres, where they are not split.
+    pub apart_max: f32,
 }
 
 /// All that is needed to read the triangles of a layer.
@@ -102,7 +104,8 @@ pub(super) fn inspect(
         level.error_max = level.error_max.max(e.error_metres);
     }
     let mut ends = HashMap::new();
-    for level in &mut levels {
+    for (i, level) in levels.iter_mut().enumerate() {
+        level.apart_max = tin.borders.get(i).copied().unwrap_or(0.0);
         if level.diamonds == 0 {
             level.error_min = 0.0;
         }

@@ -358,6 +358,8 @@ impl Tins<'_> {
         let sums = found.of.values().fold((0, 0), |(triangles, bytes), one| {
             (triangles + u64::from(one.triangles), bytes + u64::from(one.bytes))
         });
+        let apart = |level: u32| forest.diamonds(level).map(|d| found.of.get(d).apart).fold(0.0, f64::max);
+        let borders = (0..forest.levels()).map(|level| up(apart(level))).collect();
         let entry = |_, one: Known| {
             let lossless = one.vertical <= 0.0 && one.apart <= 0.0;
             let error_metres = if lossless { 0.0 } else { metres(one.vertical, one.apart) };
@@ -371,6 +373,7 @@ impl Tins<'_> {
             triangles: sums.0,
             bytes: sums.1,
             patch_triangles: self.options.patch_triangles,
+            borders,
             metric: match self.options.metric {
                 Metric::Normal => "normal".to_owned(),
                 Metric::Quadric => "quadric".to_owned(),
