@@ -15,7 +15,7 @@
 
 use super::ground::Ground;
 use super::mesh::{Mesh, NONE, Star, next};
-use super::metric::{Costs, between, turn};
+use super::metric::{Costs, between, length, turn};
 use super::queue::Queue;
 use super::{Rules, Vertex};
 use std::collections::HashMap;
@@ -26,7 +26,8 @@ pub enum Until<'a> {
     /// At so many triangles of each half, or a few less; but it goes on as long as nothing is lost.
     Triangles(usize),
     /// Likewise, but no collapse may put a sample farther away than a distance that grows from `start`, in quanta, only
-    /// when nothing is left that keeps it: so the largest error is about the least that so many triangles can have.
+    /// when nothing is left that keeps it: so the largest error is about the least that so many triangles can have. Nor
+    /// may a border move farther than that over lambda.
     Within {
         /// Triangles of each half.
         triangles: usize,
@@ -170,9 +171,14 @@ impl<'a> Simplifier<'a> {
         let (low, high) = heights.fold((f64::MAX, f64::MIN), |(low, high), h| (low.min(h), high.max(h)));
         let mut vertical = start.max(LIMIT_LEAST);
         // No sample is farther from a triangle than this, whatever goes: then only borders hold what is left.
-        let most = start + high - low;
+        let flat = |v: Vertex| Vertex { height: 0, ..v };
+        let width = length(between(&self.rules.scale, flat(self.square.a), flat(self.square.b)));
+        // A border that moves by a metre counts as lambda metres of height.
+        let per_metre = self.rules.lambda / self.rules.scale.quantum;
+        let most = (start + high - low).max(width * per_metre);
         loop {
-            self.until = Until::Error { ground, vertical, border: f64::INFINITY };
+            let border = if per_metre > 0.0 { vertical / per_metre } else { f64::INFINITY };
+            self.until = Until::Error { ground, vertical, border };
             self.pass();
             if self.mesh.live <= self.target || vertical > most {
                 return;
