@@ -225,6 +225,7 @@ fn with_tin(built: Built, forest: Forest, height: fn(u32, u32) -> i32) -> Built 
         triangles: 0,
         bytes: payloads.values().map(|p| p.len() as u64).sum(),
         patch_triangles: 0,
+        borders: Vec::new(),
         metric: "none".into(),
         lambda: 1.0,
         patch_error: None,

@@ -135,6 +135,10 @@ pub struct TinLayer {
     pub bytes: u64,
     /// Triangles at which the simplification of a patch stops, above the finest level.
     pub patch_triangles: u32,
+    /// By level of diamonds: the largest distance, in metres, between borders along nodata as they are drawn where such a
+    /// diamond is not split and the source's. The errors of these diamonds hold it already.
+    #[serde(default)]
+    pub borders: Vec<f32>,
     /// The order of collapses: "normal" or "quadric".
     pub metric: String,
     /// How much the borders along nodata count in that order.

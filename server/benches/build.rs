@@ -56,12 +56,16 @@ fn whole(criterion: &mut Criterion, folder: &Path) {
     let shape = format!("{0}x{0}:i16", SIDE + 1).parse().expect("a shape");
     let ingest = ingest::Options { raw: Some(shape), cell: Some(30.0), ..ingest::Options::default() };
     let source = ingest::open(&[dem], &ingest).expect("the file just written");
-    let options = hierarchy::Options { memory: 1 << 30, fresh: true, ..hierarchy::Options::new("bench") };
+    let points = hierarchy::Options { memory: 1 << 30, fresh: true, ..hierarchy::Options::new("bench") };
+    let triangles =
+        hierarchy::Options { points: false, tin: Some(hierarchy::TinOptions::default()), ..points.clone() };
     let mut group = criterion.benchmark_group("build");
     group.throughput(Throughput::Elements(u64::from(SIDE + 1).pow(2))).sample_size(10);
-    group.bench_function("whole", |b| {
-        b.iter(|| hierarchy::build(&source, &folder.join("store"), &options, &Progress::hidden()));
-    });
+    for (name, options) in [("whole", points), ("whole_tin", triangles)] {
+        group.bench_function(name, |b| {
+            b.iter(|| hierarchy::build(&source, &folder.join("store"), &options, &Progress::hidden()));
+        });
+    }
     group.finish();
 }
 

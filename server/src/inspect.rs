@@ -33,6 +33,16 @@ pub enum InspectError {
         /// The page.
         page: u32,
     },
+    /// The layer was built without points.
+    #[error(
+        "layer {layer} has no points, only {has:?}: build the store again with --encoding points, or with both"
+    )]
+    NoEncoding {
+        /// The layer.
+        layer: String,
+        /// What it has.
+        has: Vec<String>,
+    },
     /// A page of the index cannot be read.
     #[error("layer {layer}: {error}")]
     Page {

@@ -101,7 +101,7 @@ struct BuildArgs {
     /// Seconds between checkpoints: the most work that a kill costs
     #[arg(long, default_value_t = hierarchy::CHECKPOINT.as_secs(), value_name = "SECONDS")]
     checkpoint: u64,
-    /// Only estimate, from a sample of the source, what the build would take and give; nothing is written
+    /// Only estimate, from a sample of the source, what a build of points would take and give; nothing is written
     #[arg(long)]
     dry_run: bool,
     /// Print the report as JSON
@@ -624,14 +624,17 @@ fn print_inspection(out: &mut impl Write, i: &Inspection) -> std::io::Result<()>
 }
 
 fn print_triangles(out: &mut impl Write, i: &TinInspection, about: &Layer) -> std::io::Result<()> {
-    writeln!(out, "  level  diamonds        bytes    triangles   error min [m]   error max [m]   (tin)")?;
+    writeln!(
+        out,
+        "  level  diamonds        bytes    triangles   error min [m]   error max [m]   borders [m]   (tin)"
+    )?;
     for l in &i.levels {
         // How many there are is known once they are decoded.
         let triangles = l.triangles.map_or_else(|| "-".to_owned(), |n| n.to_string());
         writeln!(
             out,
-            "  {:>5} {:>9} {:>12} {triangles:>12} {:>15} {:>15}",
-            l.level, l.diamonds, l.bytes, l.error_min, l.error_max
+            "  {:>5} {:>9} {:>12} {triangles:>12} {:>15} {:>15} {:>13.1}",
+            l.level, l.diamonds, l.bytes, l.error_min, l.error_max, l.apart_max
         )?;
     }
     writeln!(out, "  finest error {} m (asked: {} m), errors {}", i.finest_error, about.max_error, i.errors)?;
@@ -639,7 +642,12 @@ fn print_triangles(out: &mut impl Write, i: &TinInspection, about: &Layer) -> st
         out,
         "  {} triangles in {} bytes, {:.3} bits each; {} bytes of index",
         i.triangles, i.bytes, i.bits_per_triangle, i.index_bytes
-    )
+    )?;
+    if !i.cuts.is_empty() {
+        let cuts: Vec<String> = i.cuts.iter().map(|c| format!("{} m {}", c.error, c.triangles)).collect();
+        writeln!(out, "  triangles of the coarsest cut that keeps an error: {}", cuts.join(", "))?;
+    }
+    Ok(())
 }
 
 fn compute_zone(args: ZoneArgs) -> Result<(), Failure> {

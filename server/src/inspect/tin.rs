@@ -33,6 +33,19 @@ pub struct TinInspection {
     pub finest_error: f32,
     /// How errors were found.
     pub errors: String,
+    /// What cuts draw, if the blobs were verified.
+    pub cuts: Vec<TinCut>,
+}
+
+/// The coarsest cut that keeps an error everywhere.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct TinCut {
+    /// The error, in metres.
+    pub error: f64,
+    /// The triangles that it draws.
+    pub triangles: u64,
+    /// The diamonds that it splits.
+    pub diamonds: u64,
 }
 
 /// The diamonds of a level in numbers.
@@ -50,6 +63,8 @@ pub struct TinLevel {
     pub error_min: f32,
     /// The largest declared error, in metres.
     pub error_max: f32,
+    /// The largest distance of borders along nodata from the source's, in metres, where they are not split.
+    pub apart_max: f32,
 }
 
 /// All that is needed to read the triangles of a layer.
@@ -88,14 +103,22 @@ pub(super) fn inspect(
         level.error_min = level.error_min.min(e.error_metres);
         level.error_max = level.error_max.max(e.error_metres);
     }
-    for level in levels.iter_mut() {
+    let mut ends = HashMap::new();
+    for (i, level) in levels.iter_mut().enumerate() {
+        level.apart_max = tin.borders.get(i).copied().unwrap_or(0.0);
         if level.diamonds == 0 {
             level.error_min = 0.0;
         }
         if verify {
-            level.triangles = Some(reader.verify(level.level)?);
+            let verified = reader.verify(level.level)?;
+            level.triangles = Some(verified.iter().map(|(_, ends)| u64::from(ends[3])).sum());
+            ends.extend(verified);
         }
     }
+    let largest = reader.entries.values().map(|e| f64::from(e.error_metres)).fold(0.0, f64::max);
+    let round = (-3..7).flat_map(|ten| [1.0, 2.0, 3.0, 5.0].map(|digit| digit * 10f64.powi(ten)));
+    let asked = round.filter(|e| verify && *e >= f64::from(tin.finest_error) && *e < largest);
+    let cuts = asked.map(|error| reader.cut(&ends, error)).collect();
     let bytes = levels.iter().map(|l| l.bytes).sum();
     Ok(TinInspection {
         triangles: tin.triangles,
@@ -105,6 +128,7 @@ pub(super) fn inspect(
         levels,
         finest_error: tin.finest_error,
         errors: tin.errors.clone(),
+        cuts,
     })
 }
 
@@ -148,12 +172,33 @@ impl Reader<'_> {
             .map_err(|error| InspectError::Triangles { layer: layer(), centre, error })
     }
 
-    /// Decodes all payloads of a level and compares them with those that share a line with them; how many triangles
-    /// there are.
-    fn verify(&self, level: u32) -> Result<u64, InspectError> {
+    /// The coarsest cut that keeps an error: errors never rise where a diamond splits.
+    fn cut(&self, ends: &HashMap<Diamond, [u32; 4]>, error: f64) -> TinCut {
+        let forest = &self.tin.forest;
+        let splits = |d: Diamond| {
+            let declared = self.entries.get(&d).map_or(0.0, |e| f64::from(e.error_metres));
+            d.level() == 0 || declared > error
+        };
+        let mut cut = TinCut { error, triangles: 0, diamonds: 0 };
+        for (d, ends) in ends.iter().filter(|(d, _)| splits(**d)) {
+            cut.diamonds += 1;
+            let mut from = 0;
+            for (child, end) in forest.children(*d).into_iter().zip(ends) {
+                if child.is_none_or(|c| !splits(c)) {
+                    cut.triangles += u64::from(end - from);
+                }
+                from = *end;
+            }
+        }
+        cut
+    }
+
+    /// Decodes all payloads of a level and compares them with those that share a line with them; where the triangles
+    /// of each diamond's children end.
+    fn verify(&self, level: u32) -> Result<Vec<(Diamond, [u32; 4])>, InspectError> {
         let forest = &self.tin.forest;
         let diamonds: Vec<Diamond> = forest.diamonds(level).collect();
-        let of_diamond = |d: &Diamond| -> Result<u64, InspectError> {
+        let of_diamond = |d: &Diamond| {
             let patch = self.patch(*d)?;
             let fits = |line: [[u32; 2]; 2], other: &Patch| {
                 let fit = fits(&along(&patch, line), &along(other, line));
@@ -174,9 +219,9 @@ impl Reader<'_> {
                     }
                 }
             }
-            Ok(patch.triangles.len() as u64)
+            Ok((*d, patch.ends))
         };
-        diamonds.par_iter().map(of_diamond).sum()
+        diamonds.par_iter().map(of_diamond).collect()
     }
 }
 

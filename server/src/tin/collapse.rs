@@ -15,7 +15,7 @@
 
 use super::ground::Ground;
 use super::mesh::{Mesh, NONE, Star, next};
-use super::metric::{Costs, between, turn};
+use super::metric::{Costs, between, length, turn};
 use super::queue::Queue;
 use super::{Rules, Vertex};
 use std::collections::HashMap;
@@ -25,6 +25,17 @@ use std::collections::HashMap;
 pub enum Until<'a> {
     /// At so many triangles of each half, or a few less; but it goes on as long as nothing is lost.
     Triangles(usize),
+    /// Likewise, but no collapse may put a sample farther away than a distance that grows from `start`, in quanta, only
+    /// when nothing is left that keeps it: so the largest error is about the least that so many triangles can have. Nor
+    /// may a border move farther than that over lambda.
+    Within {
+        /// Triangles of each half.
+        triangles: usize,
+        /// The samples of the diamond.
+        ground: Ground<'a>,
+        /// How far they are from it as it is, in quanta; at least half of one.
+        start: f64,
+    },
     /// Where any further collapse would put a sample farther away than so many quanta, or a border than so
     /// many metres.
     Error {
@@ -36,6 +47,11 @@ pub enum Until<'a> {
         border: f64,
     },
 }
+
+/// Where the limit of a count begins, in quanta, and how it grows: in finer steps there are more passes, and hardly fewer
+/// triangles.
+const LIMIT_LEAST: f64 = 0.5;
+const LIMIT_GROWTH: f64 = 1.5;
 
 /// What may become of a vertex.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -94,6 +110,8 @@ pub(super) struct Simplifier<'a> {
     square: Square,
     rules: &'a Rules,
     until: Until<'a>,
+    /// Triangles that are few enough, whatever else allows.
+    target: usize,
     costs: Costs,
     roles: Vec<Role>,
     queue: Queue,
@@ -116,18 +134,56 @@ impl<'a> Simplifier<'a> {
         let roles = mesh.points.iter().map(|v| square.role(*v)).collect();
         let queue = Queue::new(mesh.points.len());
         let (star, other, ways) = (Star::default(), Star::default(), Vec::new());
-        Self { mesh, passed, is_source, square, rules, until, costs, roles, queue, star, other, ways }
+        Self {
+            mesh,
+            passed,
+            is_source,
+            square,
+            rules,
+            until,
+            target: 0,
+            costs,
+            roles,
+            queue,
+            star,
+            other,
+            ways,
+        }
     }
 
     /// Collapses until there is nothing left to do; on beyond an error as long as there are more triangles than a
     /// payload has room for.
     pub(super) fn run(&mut self) {
+        if let Until::Within { triangles, ground, start } = self.until {
+            return self.run_within(triangles, ground, start);
+        }
         self.pass();
-        if matches!(self.until, Until::Error { .. })
-            && self.mesh.live > self.halves().saturating_mul(self.rules.triangles_max)
-        {
+        let most = self.halves().saturating_mul(self.rules.triangles_max);
+        if matches!(self.until, Until::Error { .. }) && self.mesh.live > most {
             self.until = Until::Triangles(self.rules.triangles_max);
             self.pass();
+        }
+    }
+
+    fn run_within(&mut self, triangles: usize, ground: Ground<'a>, start: f64) {
+        self.target = self.halves().saturating_mul(triangles);
+        let heights = self.mesh.points.iter().map(|v| f64::from(v.height));
+        let (low, high) = heights.fold((f64::MAX, f64::MIN), |(low, high), h| (low.min(h), high.max(h)));
+        let mut vertical = start.max(LIMIT_LEAST);
+        // No sample is farther from a triangle than this, whatever goes: then only borders hold what is left.
+        let flat = |v: Vertex| Vertex { height: 0, ..v };
+        let width = length(between(&self.rules.scale, flat(self.square.a), flat(self.square.b)));
+        // A border that moves by a metre counts as lambda metres of height.
+        let per_metre = self.rules.lambda / self.rules.scale.quantum;
+        let most = (start + high - low).max(width * per_metre);
+        loop {
+            let border = if per_metre > 0.0 { vertical / per_metre } else { f64::INFINITY };
+            self.until = Until::Error { ground, vertical, border };
+            self.pass();
+            if self.mesh.live <= self.target || vertical > most {
+                return;
+            }
+            vertical *= LIMIT_GROWTH;
         }
     }
 
@@ -173,7 +229,9 @@ impl<'a> Simplifier<'a> {
                 self.mesh.live <= self.halves().saturating_mul(target)
                     && !self.costs.importance(&self.mesh, v, &mut self.other).1
             }
-            Until::Error { .. } => false,
+            Until::Error { .. } | Until::Within { .. } => {
+                self.mesh.live <= self.target && !self.costs.importance(&self.mesh, v, &mut self.other).1
+            }
         }
     }
 

@@ -68,6 +68,9 @@ fn build(field: &Field, rules: &Rules, until: impl Fn(u32) -> Until<'static>) ->
                 Until::Error { vertical, border, .. } => {
                     Until::Error { ground: field.ground(), vertical, border }
                 }
+                Until::Within { triangles, start, .. } => {
+                    Until::Within { triangles, ground: field.ground(), start }
+                }
                 Until::Triangles(n) => Until::Triangles(n),
             };
             let simplified = simplify(&deep, d, &merged, rules, until);
@@ -387,6 +390,40 @@ fn an_error_that_was_asked_is_kept_at_every_collapse() {
         assert_closed(&field.forest, &drawn, complete);
         assert_near(&field, &SCALE, &drawn);
     }
+}
+
+#[test]
+fn a_limit_that_grows_ends_at_the_count_with_smaller_errors() {
+    let (mut fewer, mut all) = (0, 0);
+    for (name, field) in fields() {
+        let finest = field.forest.levels();
+        let until = |within: bool| {
+            move |level: u32| match (level == finest, within) {
+                (true, _) => Until::Error { ground: nowhere(), vertical: 0.0, border: 0.0 },
+                (_, true) => Until::Within { triangles: 20, ground: nowhere(), start: 0.5 },
+                (_, false) => Until::Triangles(20),
+            }
+        };
+        let [free, held] =
+            [false, true].map(|within| build(&field, &rules(Metric::Normal, 1.0), until(within)));
+        for (d, whole) in &held.whole {
+            let count = |w: &Whole| w.simplified.halves.iter().map(|h| h.triangles.len()).sum::<usize>();
+            if d.level() < finest && !field.heights.contains(&NODATA) {
+                assert!(count(whole) <= 80, "{name}: {} triangles of {d:?}", count(whole));
+            }
+            if d.level() < finest && free.whole[d].vertical > 0.0 {
+                all += 1;
+                fewer += usize::from(whole.vertical <= free.whole[d].vertical);
+            }
+        }
+        let mut dice = dice(55);
+        for _ in 0..4 {
+            let drawn = held.draw(|_| !dice().is_multiple_of(3));
+            assert_closed(&field.forest, &drawn, !field.heights.contains(&NODATA));
+            assert_near(&field, &SCALE, &drawn);
+        }
+    }
+    assert!(10 * fewer > 8 * all, "{fewer} of {all} have no larger error");
 }
 
 #[test]

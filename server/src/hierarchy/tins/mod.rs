@@ -77,14 +77,15 @@ pub const LAMBDA: f64 = 1.0;
 /// Base-2 logarithm of the side of a tile, in cells; of larger diamonds each has one of its own.
 const TILE_LOG2: u32 = 10;
 
-/// Samples that a worker reads at once: 16 MiB.
-const WINDOW_SAMPLES: u64 = 1 << 22;
+/// Samples that a worker reads at once: those of a diamond 4096 cells wide, 64 MiB. The samples of larger ones are looked
+/// at when they are simplified, not at each collapse, unless an error was asked.
+const WINDOW_SAMPLES: u64 = (1 << 24) + (1 << 14);
 
 /// What the program, its threads and the source's cache take, as for points.
 const BASE_BYTES: u64 = 96 << 20;
 
 /// Of a worker: samples, meshes, halves.
-const WORKER_BYTES: u64 = 64 << 20;
+const WORKER_BYTES: u64 = 128 << 20;
 
 /// 32 (known) + 16 (place) + 40 (spool) + 40 (pack) + 32 (directory) + 16 (entry).
 const DIAMOND_BYTES: u64 = 176;
@@ -358,6 +359,8 @@ impl Tins<'_> {
         let sums = found.of.values().fold((0, 0), |(triangles, bytes), one| {
             (triangles + u64::from(one.triangles), bytes + u64::from(one.bytes))
         });
+        let apart = |level: u32| forest.diamonds(level).map(|d| found.of.get(d).apart).fold(0.0, f64::max);
+        let borders = (0..forest.levels()).map(|level| up(apart(level))).collect();
         let entry = |_, one: Known| {
             let lossless = one.vertical <= 0.0 && one.apart <= 0.0;
             let error_metres = if lossless { 0.0 } else { metres(one.vertical, one.apart) };
@@ -371,6 +374,7 @@ impl Tins<'_> {
             triangles: sums.0,
             bytes: sums.1,
             patch_triangles: self.options.patch_triangles,
+            borders,
             metric: match self.options.metric {
                 Metric::Normal => "normal".to_owned(),
                 Metric::Quadric => "quadric".to_owned(),

@@ -135,7 +135,7 @@ impl Tins<'_> {
         if d.level() == 0 {
             return Ok(one);
         }
-        let until = self.until(d.level(), window);
+        let until = self.until(d.level(), merged, window);
         let simplified = simplify(forest, d, merged, &self.rules(), until);
         one.apart = simplified.apart;
         one.vertical = match window {
@@ -146,15 +146,18 @@ impl Tins<'_> {
         Ok(one)
     }
 
-    /// Where the simplification of a level stops.
-    fn until<'b>(&self, level: u32, window: Option<&'b Window>) -> Until<'b> {
-        match (self.options.patch_error, window) {
-            (Some(error), Some(window)) => {
-                let above = f64::from(self.forest.levels() - 1 - level);
-                self.limit(error * (above / 2.0).exp2(), ground(window))
-            }
-            _ => Until::Triangles(self.options.patch_triangles as usize),
+    /// Where the simplification of a diamond stops.
+    fn until<'b>(&self, level: u32, merged: &Merged, window: Option<&'b Window>) -> Until<'b> {
+        let triangles = self.options.patch_triangles as usize;
+        let Some(ground) = window.map(ground) else { return Until::Triangles(triangles) };
+        if let Some(error) = self.options.patch_error {
+            let above = f64::from(self.forest.levels() - 1 - level);
+            return self.limit(error * (above / 2.0).exp2(), ground);
         }
+        let patch = &merged.patch;
+        let corners = patch.triangles.iter().map(|t| t.map(|v| patch.vertices[v as usize]));
+        let start = corners.map(|t| ground.distance(t, f64::INFINITY)).fold(0.0, f64::max);
+        Until::Within { triangles, ground, start }
     }
 
     /// Stops at an error in metres.
@@ -207,7 +210,7 @@ impl Tins<'_> {
     fn distance_in_bands(&self, d: Diamond, halves: &[Tin; 2]) -> Result<f64, BuildError> {
         let [low, high] = self.forest.bounds(d);
         let width = u64::from(high[0] - low[0] + 1);
-        let rows = u32::try_from((WINDOW_SAMPLES / 4 / width).max(1)).unwrap_or(u32::MAX);
+        let rows = u32::try_from((WINDOW_SAMPLES / 16 / width).max(1)).unwrap_or(u32::MAX);
         let bands: Vec<u32> = (low[1]..=high[1]).step_by(rows as usize).collect();
         let band = |y: u32| {
             let last = high[1].min(y.saturating_add(rows - 1));
