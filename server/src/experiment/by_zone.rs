@@ -121,12 +121,10 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
 /// Where the viewer stays.
 struct Region {
     name: String,
-    /// Samples that belong to it.
-    own: Vec<Point>,
+    /// Samples that belong to it, and the highest place of an eye there, metres.
+    own: Vec<(Point, f64)>,
     /// The eyes of the mask.
     eyes: Vec<Eye>,
-    /// The highest place of an eye, metres.
-    ceiling: f64,
 }
 
 fn one(
@@ -154,7 +152,7 @@ fn one(
     run.progress.stage("casting rays", "eyes", region.eyes.len() as u64, 0);
     let mut mask =
         cast(&ground.relief, &optics, &region.eyes, run.progress).ok_or(ExperimentError::Stopped)?;
-    region.own.iter().for_each(|p| mask.set(p.map(|w| w as usize), u8::MAX));
+    region.own.iter().for_each(|(p, _)| mask.set(p.map(|w| w as usize), u8::MAX));
     let seconds = started.elapsed().as_secs_f64();
     let mask: Vec<u8> = mask.rows().collect();
     let percent = |is: &dyn Fn(u8) -> bool| {
@@ -264,22 +262,23 @@ fn from_polygon(
         );
         return Err(wrong(expected, found));
     }
-    let heights = polygons.iter().filter_map(|rings| ground.highest(rings));
-    let none = || wrong("a region with data".to_owned(), format!("none in {}", path.display()));
-    let ceiling = heights.reduce(f64::max).ok_or_else(none)? + run.options.eye;
     let cell = ground.cell[0].min(ground.cell[1]);
     let around: f64 = polygons.iter().map(|rings| perimeter(rings)).sum();
     let spacing = (SPACING_CELLS * cell).max(around / EYES);
-    let eyes =
-        polygons.iter().flat_map(|rings| contour(rings, spacing)).map(|p| ground.eye(p, ceiling)).collect();
-    let mut own = Vec::new();
+    let (mut own, mut eyes) = (Vec::new(), Vec::new());
     for rings in &polygons {
-        ground.own(rings, |at| own.push(at.map(|w| u32::try_from(w).unwrap_or(u32::MAX))));
+        let Some(highest) = ground.highest(rings) else {
+            let found = format!("a polygon without any in {}", path.display());
+            return Err(wrong("polygons with data".to_owned(), found));
+        };
+        let ceiling = highest + run.options.eye;
+        eyes.extend(contour(rings, spacing).into_iter().map(|p| ground.eye(p, ceiling)));
+        ground.own(rings, |at| own.push((at.map(|w| u32::try_from(w).unwrap_or(u32::MAX)), ceiling)));
     }
-    own.sort_unstable_by_key(|p| [p[1], p[0]]);
-    own.dedup();
+    own.sort_unstable_by(|(p, a), (q, b)| [p[1], p[0]].cmp(&[q[1], q[0]]).then(b.total_cmp(a)));
+    own.dedup_by_key(|(p, _)| *p);
     let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    Ok(Region { name, own, eyes, ceiling })
+    Ok(Region { name, own, eyes })
 }
 
 fn from_lake(run: &Run<'_>, window: &Window, ground: &Ground) -> Result<Region, ExperimentError> {
@@ -311,7 +310,8 @@ fn from_lake(run: &Run<'_>, window: &Window, ground: &Ground) -> Result<Region, 
     }
     let eye = |p: &Point| Eye { place: p.map(f64::from), height: ceiling / ground.quantum };
     let name = format!("lake of {} cells at {height:.0} m", cells.len());
-    Ok(Region { name, own, eyes: posts.iter().map(eye).collect(), ceiling })
+    let own = own.into_iter().map(|p| (p, ceiling)).collect();
+    Ok(Region { name, own, eyes: posts.iter().map(eye).collect() })
 }
 
 /// The largest piece of cells whose four corners have one height and which share sides, by their south-west corners.
@@ -370,10 +370,10 @@ impl<'a> Sight<'a> {
         let field = &window.field;
         let step = (region.own.len() / PLACES).max(1);
         let places = region.own.iter().skip(step / 2).step_by(step).take(PLACES);
-        let eye = |(i, p): (usize, &Point)| {
-            let ground = Some(field.at(*p)).filter(|h| !h.is_nan() && *h < region.ceiling);
-            let low = ground.map_or(region.ceiling, |ground| f64::midpoint(ground, region.ceiling));
-            let height = if i % 2 == 0 { region.ceiling } else { low };
+        let eye = |(i, (p, ceiling)): (usize, &(Point, f64))| {
+            let ground = Some(field.at(*p)).filter(|h| !h.is_nan() && h < ceiling);
+            let low = ground.map_or(*ceiling, |ground| f64::midpoint(ground, *ceiling));
+            let height = if i % 2 == 0 { *ceiling } else { low };
             Eye { place: p.map(f64::from), height: height / QUANTUM }
         };
         let eyes: Vec<Eye> = places.enumerate().map(eye).collect();
@@ -479,7 +479,7 @@ impl<'a> Sight<'a> {
 }
 
 /// The mask over the shaded ground, north up.
-fn map(field: &Field, mask: &[u8], own: &[Point]) -> Result<Vec<u8>, png::EncodingError> {
+fn map(field: &Field, mask: &[u8], own: &[(Point, f64)]) -> Result<Vec<u8>, png::EncodingError> {
     let row = field.row();
     let mut pixels = vec![[0u8; 3]; row * row];
     for (slot, pixel) in pixels.iter_mut().enumerate() {
@@ -500,7 +500,7 @@ fn map(field: &Field, mask: &[u8], own: &[Point]) -> Result<Vec<u8>, png::Encodi
             *pixel = lit;
         }
     }
-    own.iter().for_each(|p| pixels[field.slot(*p)] = [40, 90, 170]);
+    own.iter().for_each(|(p, _)| pixels[field.slot(*p)] = [40, 90, 170]);
     let mut bytes = Vec::new();
     let size = u32::try_from(row).unwrap_or(u32::MAX);
     let mut encoder = png::Encoder::new(&mut bytes, size, size);

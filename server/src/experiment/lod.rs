@@ -4,8 +4,8 @@
 //! this program: the cut is the client's, and no copy of it is kept here. Each frame waits for its data, so what a
 //! flight takes follows from its path and the terms alone.
 
-use super::report::{Report, Table};
-use super::{ExperimentError, Whole};
+use super::report::{Picture, Report, Table};
+use super::{ExperimentError, Whole, plot};
 use crate::client_program::{self, NoClient};
 use crate::hierarchy::{self, BuildError};
 use crate::http::{ServeError, Server};
@@ -39,6 +39,8 @@ struct Flown {
     terms: &'static str,
     /// That went over the wire.
     bytes: u64,
+    /// The same up to each frame.
+    received: Vec<u64>,
     /// Drawn a frame, on average.
     triangles: f64,
     /// The largest error of any frame, as the terms count it.
@@ -118,11 +120,14 @@ pub(super) fn run(whole: &Whole<'_>) -> Result<Report, ExperimentError> {
     ];
     let caption = "Flights with each term on and off; savings are against distance alone";
     let mut table = Table::new("lod", caption, &columns);
+    let mut pictures = Vec::new();
     for path in whole.sources {
         let source = ingest::open(std::slice::from_ref(path), whole.ingest)?;
         let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
         let mut plain: Option<Flown> = None;
-        for flown in fly_over(&source, plan, whole.progress)? {
+        let all = fly_over(&source, plan, whole.progress)?;
+        pictures.extend(plots(&name, pictures.len(), &all)?);
+        for flown in all {
             if plain.as_ref().is_none_or(|p| p.flight != flown.flight) {
                 plain = Some(flown.clone());
             }
@@ -152,7 +157,25 @@ pub(super) fn run(whole: &Whole<'_>) -> Result<Report, ExperimentError> {
             .to_owned()
             + &format!("{foveation}."),
     ];
-    Ok(Report { title: "Level of detail".to_owned(), notes, tables: vec![table], pictures: Vec::new() })
+    Ok(Report { title: "Level of detail".to_owned(), notes, tables: vec![table], pictures })
+}
+
+/// The bytes received up to each frame, a plot a flight.
+fn plots(source: &str, first: usize, all: &[Flown]) -> Result<Vec<Picture>, ExperimentError> {
+    let mut pictures = Vec::new();
+    for flights in all.chunk_by(|a, b| a.flight == b.flight) {
+        let line = |flown: &Flown| {
+            let points =
+                flown.received.iter().enumerate().map(|(i, bytes)| [i as f64, *bytes as f64 / 1000.0]);
+            plot::Series { name: flown.terms.to_owned(), points: points.collect() }
+        };
+        let series: Vec<plot::Series> = flights.iter().map(line).collect();
+        let title = format!("{source}: bytes of the flight '{}'", flights[0].flight);
+        let bytes = plot::lines(&title, ["frame", "received [kB]"], false, &series)?;
+        let file = format!("{}-{}.svg", first + pictures.len(), flights[0].flight);
+        pictures.push(Picture { file, caption: title, bytes });
+    }
+    Ok(pictures)
 }
 
 /// Builds a source, flies over it with each set of terms, and says what that took.
@@ -230,11 +253,13 @@ fn read(csv: &str, flight: &'static str, terms: &'static str) -> Option<Flown> {
     let names: Vec<&str> = lines.next()?.split(',').collect();
     let column = |name: &str| names.iter().position(|n| *n == name);
     let (bytes, triangles, error) = (column("bytes")?, column("triangles")?, column("error_pixels")?);
-    let mut flown = Flown { flight, terms, bytes: 0, triangles: 0.0, error_pixels: 0.0 };
+    let mut flown =
+        Flown { flight, terms, bytes: 0, received: Vec::new(), triangles: 0.0, error_pixels: 0.0 };
     let mut frames = 0.0;
     for line in lines {
         let fields: Vec<&str> = line.split(',').collect();
         flown.bytes = fields.get(bytes)?.parse().ok()?;
+        flown.received.push(flown.bytes);
         flown.triangles += fields.get(triangles)?.parse::<f64>().ok()?;
         flown.error_pixels = flown.error_pixels.max(fields.get(error)?.parse().ok()?);
         frames += 1.0;

@@ -90,7 +90,8 @@ impl Optics {
         });
         let width = self.cell[0].min(self.cell[1]) / SQRT_2;
         let ratio = (width / reach[0].hypot(reach[1])).max(self.epsilon);
-        (TAU / (ratio / 2.0).atan()).ceil() as usize
+        // So many in a quarter: else a ray would run along an axis, and on the edges of triangles.
+        ((TAU / (ratio / 2.0).atan()).ceil() as usize).next_multiple_of(4)
     }
 
     /// The least share that is told apart from hidden.
@@ -119,7 +120,7 @@ pub fn cast(relief: &Relief, optics: &Optics, eyes: &[Eye], progress: &Progress)
             return;
         }
         for i in *first..(first + AZIMUTHS_AT_ONCE).min(*azimuths) {
-            // Half a step off the axes, along which rays would run on the edges of triangles.
+            // Half a step off the axes.
             let azimuth = (i as f64 + 0.5) / *azimuths as f64 * TAU;
             Walk {
                 plane: Plane::new(relief, optics, *eye, azimuth),
