@@ -26,7 +26,8 @@ pub struct Limits {
     /// Seconds for which a version is served after another took its place
     #[arg(long, default_value_t = 300, value_name = "SECONDS")]
     pub grace: u32,
-    /// How long the head of a request may take.
+    /// How long the head of a request may take; over HTTP/1.1 the wait for the next request counts, as hyper's timer
+    /// begins with the answer before.
     #[arg(skip = Duration::from_secs(10))]
     pub head: Duration,
     /// How long a connection may stand still, whether it waits for a request or for a reader.
