@@ -1,9 +1,11 @@
-//! The exact criterion: selection from the top on one core, and measuring what it gave.
+//! The exact criterion on one core: selection from the top, the same with pruning, and measuring what it gave.
 #![allow(clippy::cast_possible_truncation, reason = "heights below 3000 m")]
 
 use criterion::{Criterion as Bench, Throughput};
 use diamantina_server::experiment::field::Field;
-use diamantina_server::experiment::select::{Criterion, Ground, largest_error, top_down};
+use diamantina_server::experiment::select::{
+    Criterion, Ground, Strategy, by_strategy, largest_error, top_down,
+};
 use std::hint::black_box;
 
 const LOG2: u8 = 10;
@@ -29,6 +31,9 @@ fn main() {
         let tolerance = f64::from(percent) / 100.0 * field.relief();
         group.bench_function(format!("top_down_{percent}_percent"), |b| {
             b.iter(|| top_down(&ground, Criterion::Vertical, black_box(tolerance), 0.0));
+        });
+        group.bench_function(format!("compact_{percent}_percent"), |b| {
+            b.iter(|| by_strategy(&ground, Criterion::Vertical, black_box(tolerance), Strategy::Compact));
         });
     }
     let tree = top_down(&ground, Criterion::Vertical, 0.01 * field.relief(), 0.0);

@@ -59,19 +59,26 @@ pub const GREEDY_SHARE: f64 = 0.3;
 #[must_use]
 pub fn by_strategy(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, strategy: Strategy) -> Bitree {
     let refine = |tree| greedy(ground, criterion, tolerance, GREEDY_SHARE, usize::MAX, tree);
-    let mut tree = match strategy {
-        Strategy::Compact => top_down(ground, criterion, tolerance, 0.0),
-        Strategy::Sparse => top_down(ground, criterion, tolerance, 1.0),
-        Strategy::Greedy => refine(ground.field().tree()),
-        Strategy::Direct => criterion.direct(ground, tolerance),
+    let from_top = |share| {
+        let (tree, may_go) = top_down::descend(ground, criterion, tolerance, share);
+        (tree, Some(may_go))
+    };
+    let (mut tree, mut may_go) = match strategy {
+        Strategy::Compact => from_top(0.0),
+        Strategy::Sparse => from_top(1.0),
+        Strategy::Greedy => (refine(ground.field().tree()), None),
+        Strategy::Direct => (criterion.direct(ground, tolerance), None),
     };
     if criterion == Criterion::Euclidean {
         // A fictitious corner is near a steep triangle's plane, and too far from a flatter one's that a point
         // beside it made later: then the corner itself has to become real, which no descent does.
-        tree = refine(tree);
+        (tree, may_go) = (refine(tree), None);
     }
     if strategy != Strategy::Direct && criterion.is_measured() {
-        prune(ground, criterion, tolerance, &mut tree);
+        match may_go {
+            Some(points) => prune::prune_among(ground, criterion, tolerance, &mut tree, points),
+            None => prune(ground, criterion, tolerance, &mut tree),
+        }
     }
     tree
 }

@@ -15,19 +15,23 @@ const PASSES_MAX: usize = 3;
 
 /// Removes points while every triangle stays within `tolerance`. If all were before, all are after.
 pub fn prune(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, tree: &mut Bitree) {
-    let field = ground.field();
-    let levels = 1..=2 * u32::from(field.log2());
+    let all = all(ground, tree);
+    prune_among(ground, criterion, tolerance, tree, all);
+}
+
+/// The same where it is known which of its points might go.
+pub(super) fn prune_among(
+    ground: &Ground<'_>,
+    criterion: Criterion,
+    tolerance: f64,
+    tree: &mut Bitree,
+    mut may_go: Vec<Point>,
+) {
     for _ in 0..PASSES_MAX {
-        let mut by_level = vec![Vec::new(); 2 * usize::from(field.log2()) + 1];
-        for point in (0..field.heights().len()).map(|slot| field.point(slot)) {
-            if let Some(level) =
-                tree.level(point).filter(|l| levels.contains(l) && tree.real(point).is_some())
-            {
-                by_level[level as usize].push(point);
-            }
-        }
+        // The finest first, and row by row.
+        may_go.sort_unstable_by_key(|p| (std::cmp::Reverse(tree.level(*p)), p[1], p[0]));
         let mut removed = 0;
-        for point in by_level.into_iter().rev().flatten() {
+        for point in may_go {
             let Some(height) = tree.remove(point) else { continue };
             if is_good(ground, criterion, tolerance, tree, point) {
                 removed += 1;
@@ -38,7 +42,15 @@ pub fn prune(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, tree: &m
         if removed == 0 {
             return;
         }
+        may_go = all(ground, tree);
     }
+}
+
+/// Every real point; the corners, which always stay, do no harm.
+fn all(ground: &Ground<'_>, tree: &Bitree) -> Vec<Point> {
+    let field = ground.field();
+    let points = (0..field.heights().len()).map(|slot| field.point(slot));
+    points.filter(|p| tree.real(*p).is_some()).collect()
 }
 
 /// Whether all that is drawn around a point is within the tolerance.

@@ -87,6 +87,20 @@ proptest! {
     }
 
     #[test]
+    fn points_that_are_not_tried_again_would_have_stayed(field in any_field(), part in 0.0f64..0.6, masked in any::<bool>()) {
+        let weights: Vec<f32> = (0..SIDE * SIDE).map(|s| [1.0, 0.25, 0.0][s % 3]).collect();
+        let ground = Ground::new(&field, masked.then_some(&weights[..])).unwrap();
+        for criterion in [Criterion::Vertical, Criterion::Normal] {
+            let tolerance = part * scale(&ground, criterion);
+            for (strategy, share) in [(Strategy::Compact, 0.0), (Strategy::Sparse, 1.0)] {
+                let mut tried = top_down(&ground, criterion, tolerance, share);
+                prune(&ground, criterion, tolerance, &mut tried);
+                prop_assert!(by_strategy(&ground, criterion, tolerance, strategy) == tried, "{strategy} {criterion:?}");
+            }
+        }
+    }
+
+    #[test]
     fn without_tolerance_exactly_the_points_off_their_means_are_real(field in any_field()) {
         // Nothing else can be: a point that is off has to be sent, and one that is not is deduced.
         prop_assume!(field.samples() == SIDE * SIDE);

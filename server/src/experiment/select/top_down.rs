@@ -9,6 +9,7 @@
 //! once. So the cost is at most one scan of the field a level, and usually two or three in all.
 
 use super::{Criterion, Ground};
+use diamantina_protocol::bintree::Point;
 use diamantina_protocol::bitree::{Bitree, Draft, Facet};
 
 /// One bit for each triangle of a grid.
@@ -29,6 +30,17 @@ impl Queued {
 /// afterwards, down to the finest ones, which cannot split.
 #[must_use]
 pub fn top_down(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, share: f64) -> Bitree {
+    descend(ground, criterion, tolerance, share).0
+}
+
+/// The same, with those of its points that might go again. A point whose own sample would be off by more than the
+/// tolerance without it has to stay, and most are such: what they hang between has its final height by then.
+pub(super) fn descend(
+    ground: &Ground<'_>,
+    criterion: Criterion,
+    tolerance: f64,
+    share: f64,
+) -> (Bitree, Vec<Point>) {
     let field = ground.field();
     let tree = field.tree();
     let finest = 2 * u32::from(field.log2());
@@ -37,6 +49,7 @@ pub fn top_down(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, share
     let mut draft = Draft::of(tree);
     // How many of a point's triangles are split for their own sake; a point is the middle of those of one level.
     let mut split_at = vec![0u8; field.heights().len()];
+    let mut may_go = Vec::new();
     for level in 0..finest {
         now.retain(|facet| {
             // The middle is one of the samples, and often tells enough.
@@ -52,11 +65,15 @@ pub fn top_down(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, share
         for facet in &now {
             let m = facet.middle();
             let off = off(ground, facet);
-            let is_off = match criterion.distance(ground, field.slot(m), off) {
+            let distance = criterion.distance(ground, field.slot(m), off);
+            let is_off = match distance {
                 Some(distance) => distance > share * tolerance,
                 None => off != 0.0,
             };
             if is_off && !off.is_nan() && draft.add(m, field.at(m)).is_none() {
+                if criterion != Criterion::Vertical || distance <= Some(tolerance) {
+                    may_go.push(m);
+                }
                 let is_outermost = m.iter().any(|w| *w == 0 || *w == 1 << field.log2());
                 if split_at[field.slot(m)] < 2 && !is_outermost {
                     across.extend(draft.around(m).into_iter().flatten());
@@ -71,7 +88,7 @@ pub fn top_down(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, share
             now.extend(draft.halves(&facet));
         }
     }
-    draft.finish()
+    (draft.finish(), may_go)
 }
 
 /// How far the sample at a triangle's middle is above the hypotenuse; NaN without data.
