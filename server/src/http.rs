@@ -22,7 +22,7 @@ use axum::extract::{Path as UrlPath, Query, Request, State};
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{Html, IntoResponse, Response};
-use axum::routing::get;
+use axum::routing::{MethodRouter, get};
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::index;
 use diamantina_protocol::message::{
@@ -198,12 +198,12 @@ pub fn router(scenes: Arc<Scenes>) -> Router {
         .route("/scenes/{scene}", get(scene))
         .route("/scenes/{scene}/{layer}/height", get(height_at))
         .route("/scenes/{scene}/{version}/zones/{zone}", get(zone))
-        .route("/scenes/{scene}/{version}/{layer}/index/{page}", get(index_page))
-        .route("/scenes/{scene}/{version}/{layer}/points", get(batch))
-        .route("/scenes/{scene}/{version}/{layer}/points/{x}/{y}", get(diamond))
-        .route("/scenes/{scene}/{version}/{layer}/tin/index/{page}", get(tin_index_page))
-        .route("/scenes/{scene}/{version}/{layer}/tin", get(tin_batch))
-        .route("/scenes/{scene}/{version}/{layer}/tin/{x}/{y}", get(tin_diamond))
+        .route("/scenes/{scene}/{version}/{layer}/index/{page}", pages(points))
+        .route("/scenes/{scene}/{version}/{layer}/points", batches(points))
+        .route("/scenes/{scene}/{version}/{layer}/points/{x}/{y}", diamonds(points))
+        .route("/scenes/{scene}/{version}/{layer}/tin/index/{page}", pages(tin))
+        .route("/scenes/{scene}/{version}/{layer}/tin", batches(tin))
+        .route("/scenes/{scene}/{version}/{layer}/tin/{x}/{y}", diamonds(tin))
         .route("/scenes/{scene}/{version}/{layer}/stream", get(stream))
         .fallback(|| async {
             Refusal::new(StatusCode::NOT_FOUND, "no such address: GET /scenes lists what there is")
@@ -386,51 +386,35 @@ type DiamondPath = UrlPath<(String, String, String, String, String)>;
 type BatchPath = UrlPath<(String, String, String)>;
 type Ask = Query<HashMap<String, String>>;
 
-async fn index_page(
-    state: State<Arc<Scenes>>,
-    path: PagePath,
-    headers: HeaderMap,
-) -> Result<Response, Refusal> {
-    page_of(&state, path, &headers, points)
+/// Finds one of the encodings of a layer.
+type Find = fn(&Layer) -> Result<Encoding, Refusal>;
+
+/// Answers with pages of the index of an encoding.
+fn pages(encoding: Find) -> MethodRouter<Arc<Scenes>> {
+    get(move |State(scenes): State<Arc<Scenes>>, path: PagePath, headers: HeaderMap| async move {
+        page_of(&scenes, path, &headers, encoding)
+    })
 }
 
-async fn tin_index_page(
-    state: State<Arc<Scenes>>,
-    path: PagePath,
-    headers: HeaderMap,
-) -> Result<Response, Refusal> {
-    page_of(&state, path, &headers, tin)
+/// Answers with diamonds of an encoding, one by one.
+fn diamonds(encoding: Find) -> MethodRouter<Arc<Scenes>> {
+    get(move |State(scenes): State<Arc<Scenes>>, path: DiamondPath, headers: HeaderMap| async move {
+        diamond_of(&scenes, path, &headers, encoding)
+    })
 }
 
-async fn diamond(
-    state: State<Arc<Scenes>>,
-    path: DiamondPath,
-    headers: HeaderMap,
-) -> Result<Response, Refusal> {
-    diamond_of(&state, path, &headers, points)
-}
-
-async fn tin_diamond(
-    state: State<Arc<Scenes>>,
-    path: DiamondPath,
-    headers: HeaderMap,
-) -> Result<Response, Refusal> {
-    diamond_of(&state, path, &headers, tin)
-}
-
-async fn batch(state: State<Arc<Scenes>>, path: BatchPath, query: Ask) -> Result<Response, Refusal> {
-    batch_of(&state, path, &query, points)
-}
-
-async fn tin_batch(state: State<Arc<Scenes>>, path: BatchPath, query: Ask) -> Result<Response, Refusal> {
-    batch_of(&state, path, &query, tin)
+/// Answers with many diamonds of an encoding at once.
+fn batches(encoding: Find) -> MethodRouter<Arc<Scenes>> {
+    get(move |State(scenes): State<Arc<Scenes>>, path: BatchPath, query: Ask| async move {
+        batch_of(&scenes, path, &query, encoding)
+    })
 }
 
 fn page_of(
     scenes: &Scenes,
     UrlPath((name, version, layer, page)): PagePath,
     headers: &HeaderMap,
-    encoding: fn(&Layer) -> Result<Encoding, Refusal>,
+    encoding: Find,
 ) -> Result<Response, Refusal> {
     let store = find_version(scenes, &name, &version)?;
     let (number, layer) = find_layer(&store, &layer)?;
@@ -462,7 +446,7 @@ fn diamond_of(
     scenes: &Scenes,
     UrlPath((name, version, layer, x, y)): DiamondPath,
     headers: &HeaderMap,
-    encoding: fn(&Layer) -> Result<Encoding, Refusal>,
+    encoding: Find,
 ) -> Result<Response, Refusal> {
     let store = find_version(scenes, &name, &version)?;
     let (number, layer) = find_layer(&store, &layer)?;
@@ -481,7 +465,7 @@ fn batch_of(
     scenes: &Scenes,
     UrlPath((name, version, layer)): BatchPath,
     query: &HashMap<String, String>,
-    encoding: fn(&Layer) -> Result<Encoding, Refusal>,
+    encoding: Find,
 ) -> Result<Response, Refusal> {
     let store = find_version(scenes, &name, &version)?;
     let (number, Encoding { forest, payload, .. }) = {
