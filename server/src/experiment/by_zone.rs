@@ -104,7 +104,8 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     }
     notes.extend([
         format!(
-            "Eyes stand {} m above the zone's highest ground. Hidden ground counts for {hidden}, and for more \
+            "Eyes stand {} m above the highest ground of their polygon. The bitree's selection is compact, by vertical \
+             distance. Hidden ground counts for {hidden}, and for more \
              where it is hidden by less than {angle} radians over that. A pixel is {ANGLE} radians.",
             run.options.eye
         ),
@@ -422,7 +423,8 @@ impl<'a> Sight<'a> {
             moved += u32::from(apart > 1.0);
             all += 1;
         }
-        [largest, 100.0 * f64::from(moved) / f64::from(all.max(1))]
+        // Without a place to compare from nothing is known, and that is no agreement.
+        if all == 0 { [f64::NAN; 2] } else { [largest, 100.0 * f64::from(moved) / f64::from(all)] }
     }
 
     fn row(&self, [mesh, tolerance]: [&str; 2], counts: [usize; 2], surfaces: &[Vec<f64>; 2]) -> Vec<String> {

@@ -25,10 +25,10 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
         "separate references",
         "line triangles",
         "strip references",
-        "saved [%]",
+        "saved by the strip [%]",
         "strips",
         "strips' references",
-        "saved [%]",
+        "saved by the strips [%]",
         "cached: fetches a triangle",
     ];
     let caption = "Orders of the bitree's triangles; 'full' is every sample of the grid";
