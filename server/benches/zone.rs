@@ -1,4 +1,5 @@
-//! What a zone costs: one eye over 4097 x 4097 samples of the made landscape, looking all around.
+//! What a zone costs over 4097 x 4097 samples of the made landscape: one eye looking all around, and whole masks of
+//! 200 eyes, each cast once: around a bay, and around a disc with a summit, at whose height nearly all is seen.
 #![allow(clippy::cast_possible_truncation, reason = "heights below 4000 m in decimetres")]
 
 use criterion::{Criterion, Throughput};
@@ -10,6 +11,8 @@ use diamantina_server::zone::relief::Relief;
 use diamantina_server::zone::tiled::Tiled;
 use diamantina_server::zone::{ANGLE, EPSILON, HIDDEN};
 use rayon::prelude::*;
+use std::f64::consts::TAU;
+use std::time::Instant;
 
 const SIDE: usize = 4097;
 
@@ -30,6 +33,48 @@ fn heights() -> Tiled<i32> {
     heights
 }
 
+/// A region whose contour has eyes: its centre and half axes, in shares of the side.
+struct Region {
+    name: &'static str,
+    centre: [f64; 2],
+    axes: [f64; 2],
+}
+
+const REGIONS: [Region; 2] = [
+    Region { name: "zone/mask_bay", centre: [0.235, 0.1], axes: [0.061, 0.028] },
+    Region { name: "zone/mask_summit", centre: [0.55, 0.62], axes: [0.049, 0.049] },
+];
+const EYES: usize = 200;
+
+impl Region {
+    /// Eyes along the contour, ten metres above the region's highest ground.
+    fn eyes(&self, relief: &Relief) -> Vec<Eye> {
+        let side = (SIDE - 1) as f64;
+        let at = |share: f64, angle: f64| {
+            let part = [angle.cos(), angle.sin()];
+            [0, 1].map(|k| (self.centre[k] + share * self.axes[k] * part[k]) * side)
+        };
+        let around = |n: usize| (0..n).map(move |i| i as f64 / n as f64 * TAU);
+        let places = (0..=100).flat_map(|ring| around(8 * ring + 1).map(move |a| at(ring as f64 / 100.0, a)));
+        let highest = places.filter_map(|p| relief.height(p)).fold(0.0, f64::max);
+        around(EYES).map(|a| Eye { place: at(1.0, a), height: highest + 100.0 }).collect()
+    }
+}
+
+/// Casts a whole mask once, and tells its time as the other measurements are told.
+fn whole(region: &Region, relief: &Relief, optics: &Optics) {
+    let eyes = region.eyes(relief);
+    let started = Instant::now();
+    let mask = cast(relief, optics, &eyes, &Progress::hidden()).expect("nobody stops it");
+    let seconds = started.elapsed().as_secs_f64();
+    let seen = mask.rows().filter(|share| *share == u8::MAX).count() as f64 / (SIDE * SIDE) as f64;
+    println!(
+        "{}\n    time:   [{seconds:.1} s {seconds:.1} s {seconds:.1} s] ({:.0} % seen)",
+        region.name,
+        100.0 * seen
+    );
+}
+
 fn main() {
     let mut criterion = Criterion::default().configure_from_args();
     let heights = heights();
@@ -47,5 +92,13 @@ fn main() {
         group.bench_function(name, |b| b.iter(|| cast(&relief, &optics, &[eye], &Progress::hidden())));
     }
     group.finish();
+    let words: Vec<String> = std::env::args().skip(1).collect();
+    let filters: Vec<&String> = words.iter().filter(|word| !word.starts_with('-')).collect();
+    let is_tried = words.iter().any(|word| word == "--test");
+    for region in REGIONS.iter().filter(|_| !is_tried) {
+        if filters.is_empty() || filters.iter().any(|filter| region.name.contains(filter.as_str())) {
+            whole(region, &relief, &optics);
+        }
+    }
     criterion.final_summary();
 }

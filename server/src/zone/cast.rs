@@ -306,6 +306,10 @@ struct Plane<'a> {
     sign: f64,
     /// Cells along the minor axis for one along the major: -1 to 1.
     lean: f64,
+    /// Its inverse. Kept, as is `across`: a division costs more than all else at a crossing.
+    unlean: f64,
+    /// Cells along the major axis for one across the diagonals that rise, and those that fall.
+    across: [f64; 2],
     /// Metres for a cell along the major axis.
     step: f64,
     /// Quanta by which the ground sinks at one metre.
@@ -349,6 +353,7 @@ impl<'a> Plane<'a> {
         let along = [azimuth.cos() / optics.cell[0], azimuth.sin() / optics.cell[1]];
         let major = usize::from(along[1].abs() > along[0].abs());
         let steep = along[major].abs();
+        let (sign, lean) = (1f64.copysign(along[major]), along[1 - major] / steep);
         Self {
             relief,
             heights: relief.heights(),
@@ -356,8 +361,10 @@ impl<'a> Plane<'a> {
             sizes: [relief.size()[major], relief.size()[1 - major]],
             eye: [eye.place[major], eye.place[1 - major]],
             height: eye.height,
-            sign: 1f64.copysign(along[major]),
-            lean: along[1 - major] / steep,
+            sign,
+            lean,
+            unlean: 1.0 / lean,
+            across: [1.0 / (sign - lean), 1.0 / (sign + lean)],
             step: 1.0 / steep,
             bend: optics.bend / optics.quantum,
         }
@@ -594,7 +601,7 @@ impl<W: Witness> Walk<'_, W> {
         // It leans at most one cell a column, so it crosses one line between rows at most.
         let line = f64::from(floor(low) + 1);
         if line < from.minor.max(to.minor) {
-            let cross = (line - self.plane.eye[1]) / self.plane.lean;
+            let cross = (line - self.plane.eye[1]) * self.plane.unlean;
             if cross > from.u && cross < to.u {
                 let cross = self.plane.post(cross);
                 return self.in_row(column, [from, &cross]) && self.in_row(column, [&cross, to]);
@@ -631,9 +638,8 @@ impl<W: Witness> Walk<'_, W> {
         let mut low = a.min(b).min(c.min(d));
         let has_hole = low == NODATA;
         if has_hole {
-            // Where the cell is hidden, its triangles are not looked at one by one.
-            self.sky.after_hole = true;
             if high == NODATA {
+                self.sky.after_hole = true;
                 return;
             }
             low = heights.iter().copied().filter(|h| *h != NODATA).fold(high, i32::min);
@@ -641,6 +647,7 @@ impl<W: Witness> Walk<'_, W> {
         let posts = [from, to];
         let slopes = [lowest_slope(f64::from(low), posts), highest_slope(f64::from(high), posts)];
         if !self.sky.shows(slopes) {
+            // Its triangles are not looked at one by one.
             self.sky.after_hole = has_hole;
             if self.witness.knows_seen(places) {
                 return;
@@ -663,7 +670,11 @@ impl<W: Witness> Walk<'_, W> {
         // Which side of the diagonal, and how far.
         let side = |[s, t]: [f64; 2]| if rising { s - t } else { s + t - 1.0 };
         let [a, b] = [side(local(from)), side(local(to))];
-        let cross = if a * b < 0.0 { plane.post(from.u + (to.u - from.u) * a / (a - b)) } else { *to };
+        let cross = if a * b < 0.0 {
+            plane.post((from.u - a * plane.across[usize::from(!rising)]).clamp(from.u, to.u))
+        } else {
+            *to
+        };
         let [h0, h1, h2, h3] = heights.map(f64::from);
         for ([from, to], side) in [([from, &cross], if a == 0.0 { b } else { a }), ([&cross, to], b)] {
             if from.u >= to.u {

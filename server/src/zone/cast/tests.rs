@@ -320,24 +320,50 @@ fn the_step_of_azimuth_is_half_the_least_triangle_that_counts() {
     assert!(mask.rows().all(|v| v == 255), "all of a plain is seen from above");
 }
 
-/// A ground without holes leaves nothing open below the horizon, however fine the quantum.
-#[test]
-fn rounding_opens_no_windows_in_a_surface_without_holes() {
-    let side = 120usize;
+/// Steep and rough ground of `side` by `side` samples, in millimetres.
+fn rough(side: usize) -> Vec<i32> {
     let height = |i: usize| {
         let (x, y) = ((i % side) as f64, (i / side) as f64);
         let noise = f64::from((i as u32).wrapping_mul(0x9E37_79B1) >> 20);
         ((1500.0 + 1400.0 * (x / 9.0).sin() * (y / 13.0).cos()) * 1000.0 + 90.0 * noise) as i32
     };
-    let relief = Relief::from_rows([side, side], &(0..side * side).map(height).collect::<Vec<i32>>());
-    let optics =
-        Optics { cell: [77.0, 93.0], quantum: 1e-3, bend: 0.0, epsilon: 0.0, hidden: 0.0, angle: 0.0 };
+    (0..side * side).map(height).collect()
+}
+
+const ROUGH: Optics =
+    Optics { cell: [77.0, 93.0], quantum: 1e-3, bend: 0.0, epsilon: 0.0, hidden: 0.0, angle: 0.0 };
+
+/// A ground without holes leaves nothing open below the horizon, however fine the quantum.
+#[test]
+fn rounding_opens_no_windows_in_a_surface_without_holes() {
+    let relief = Relief::from_rows([120; 2], &rough(120));
     let place = [60.3, 58.9];
     let eye = Eye { place, height: relief.height(place).unwrap() + 3000.0 };
     for i in 0..20_000 {
-        let plane = Plane::new(&relief, &optics, eye, f64::from(i) / 20_000.0 * TAU + 1e-4);
-        let mut walk = Walk { plane, sky: Sky::new(&optics), witness: |_: Seen| {} };
+        let plane = Plane::new(&relief, &ROUGH, eye, f64::from(i) / 20_000.0 * TAU + 1e-4);
+        let mut walk = Walk { plane, sky: Sky::new(&ROUGH), witness: |_: Seen| {} };
         walk.run();
         assert!(walk.sky.windows.is_empty(), "azimuth {i}: {:?}", walk.sky.windows);
     }
+}
+
+/// Where triangles of a cell have their heights, the ground goes on from one to the next, though another sample of the
+/// cell has none. What opens behind a hole is as wide as the hole is seen; what rounding opens would be a slit.
+#[test]
+fn rounding_opens_no_windows_beside_holes() {
+    let mut heights = rough(120);
+    let holes = (0u32..).map(|i| i.wrapping_mul(0x85EB_CA77) >> 16).map(|hash| hash % 9 == 0);
+    heights.iter_mut().zip(holes).filter(|(_, hole)| *hole).for_each(|(height, _)| *height = NODATA);
+    let relief = Relief::from_rows([120; 2], &heights);
+    let eye = Eye { place: [60.3, 58.9], height: 6e6 };
+    let mut opened = 0;
+    for i in 0..20_000 {
+        let plane = Plane::new(&relief, &ROUGH, eye, f64::from(i) / 20_000.0 * TAU + 1e-4);
+        let mut walk = Walk { plane, sky: Sky::new(&ROUGH), witness: |_: Seen| {} };
+        walk.run();
+        opened += walk.sky.windows.len();
+        let slit = walk.sky.windows.iter().find(|[least, most]| most - least < 1e-9 * (1.0 + most.abs()));
+        assert_eq!(slit, None, "azimuth {i}");
+    }
+    assert!(opened > 1000, "{opened}");
 }
