@@ -658,11 +658,12 @@ impl<W: Witness> Walk<'_, W> {
             }
             return;
         }
-        self.triangles([k, j], heights, posts);
+        let is_known = self.witness.knows_seen(places);
+        self.triangles([k, j], heights, posts, is_known);
     }
 
-    /// Crosses the triangles of a cell.
-    fn triangles(&mut self, [k, j]: [usize; 2], heights: [i32; 4], [from, to]: [&Post; 2]) {
+    /// Crosses the triangles of a cell. If it is known that all of them are seen, they only hide what is behind them.
+    fn triangles(&mut self, [k, j]: [usize; 2], heights: [i32; 4], [from, to]: [&Post; 2], is_known: bool) {
         let plane = &self.plane;
         let rising = (k + j).is_multiple_of(2);
         let corners = [[k, j], [k + 1, j], [k + 1, j + 1], [k, j + 1]].map(|c| plane.sample(c));
@@ -701,9 +702,9 @@ impl<W: Witness> Walk<'_, W> {
                 1.0
             } else {
                 self.sky.after_hole = false;
-                self.sky.share(slopes)
+                if is_known { 0.0 } else { self.sky.share(slopes) }
             };
-            if share > self.sky.least {
+            if share > self.sky.least && !is_known {
                 let region = Region::Triangle([corners[i], corners[c], corners[l]]);
                 self.witness.note(Seen { region, slopes, share });
             }
