@@ -1,6 +1,6 @@
 //! The command line of the server.
 
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use diamantina_protocol::message::{Kind, Layer, is_name};
 use diamantina_protocol::points::Rule;
 use diamantina_server::experiment::ExperimentError;
@@ -304,13 +304,16 @@ fn main() -> ExitCode {
         std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty());
     let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours);
     log.with_writer(std::io::stderr).init();
-    let result = match Cli::parse().command {
+    let matches = Cli::command().get_matches();
+    let cli = Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit());
+    let given = matches.subcommand().map_or(&matches, |(_, given)| given);
+    let result = match cli.command {
         Command::Build(args) => build(*args),
         Command::Serve(args) => serve(&args),
         Command::Inspect(args) => inspect_store(&args),
         Command::Zone(args) => compute_zone(*args),
         Command::Demo(args) => demonstrate(&args),
-        Command::Experiment(args) => experiment(&args),
+        Command::Experiment(args) => experiment(&args, given),
         Command::Health(args) => http::ask_health(args.address).map_err(|e| Failure(1, e)),
     };
     match result {
@@ -744,7 +747,8 @@ fn demonstrate(args: &DemoArgs) -> Result<(), Failure> {
     demo::run(&args.folder, args.samples, args.listen, headless).map_err(|e| Failure(1, e.to_string()))
 }
 
-fn experiment(args: &ExperimentArgs) -> Result<(), Failure> {
+fn experiment(args: &ExperimentArgs, given: &clap::ArgMatches) -> Result<(), Failure> {
+    experiment::refuse_ignored(&args.name, given).map_err(|e| Failure(2, e.to_string()))?;
     let progress = Arc::new(Progress::new());
     stop_on_signals(&progress)?;
     let found = experiment::run(&args.name, &args.sources, &args.ingest, &args.options, &progress);

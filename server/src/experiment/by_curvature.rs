@@ -16,8 +16,8 @@ use diamantina_protocol::bintree::Point;
 
 /// Percent of the full grid's polygons that are tried.
 const SHARES: [f64; 6] = [50.0, 20.0, 10.0, 7.0, 5.0, 2.0];
-/// The share that is pictured.
-const PICTURED: f64 = 7.0;
+/// The shares that are pictured: between them lies what an observer begins to notice.
+const PICTURED: [f64; 2] = [10.0, 5.0];
 /// Halvings of the interval of a threshold's logarithm; the last are finer than any polygon.
 const BISECTIONS: usize = 40;
 
@@ -102,15 +102,20 @@ fn one(
             ];
             table.push(row.into_iter().chain([mesh.len().to_string()]).chain(cells));
             points.push([polygons, changed]);
-            if share == PICTURED {
-                let file = rule.name.replace(' ', "-");
+            if PICTURED.contains(&share) {
+                let name = format!("{number}-{}-{share}", rule.name.replace(' ', "-"));
                 let about = format!(
                     "{} rule, {polygons:.1} % of the polygons: {changed:.2} % of the pixels change",
                     rule.name
                 );
-                pictures.push(png(format!("{number}-{file}.png"), &about, &seen)?);
-                let bytes = plot::mesh(field.side(), &mesh);
-                pictures.push(Picture { file: format!("{number}-{file}-mesh.svg"), caption: about, bytes });
+                pictures.push(png(format!("{name}.png"), &about, &seen)?);
+                let bytes = view::changes(&full, &seen).map_err(|e| ExperimentError::Plot(e.to_string()))?;
+                let caption = format!("{about}, those in red");
+                pictures.push(Picture { file: format!("{name}-changes.png"), caption, bytes });
+                let bytes =
+                    plot::mesh(field.side(), &mesh).map_err(|e| ExperimentError::Plot(e.to_string()))?;
+                let caption = format!("{} rule: {} polygons", rule.name, mesh.len());
+                pictures.push(Picture { file: format!("{name}-mesh.png"), caption, bytes });
             }
             run.progress.advance(1);
         }

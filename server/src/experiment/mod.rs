@@ -27,6 +27,7 @@ mod tolerances;
 
 use crate::ingest::IngestError;
 use crate::progress::Progress;
+use clap::parser::ValueSource;
 use diamantina_protocol::bintree::Point;
 use report::Report;
 use select::Criterion;
@@ -38,29 +39,29 @@ use std::path::PathBuf;
 pub struct Options {
     #[command(flatten)]
     pub(crate) windows: windows::Options,
-    /// Tolerances, percent of each window's relief
+    /// `tolerances`, `strips`, `zone`: tolerances, percent of each window's relief
     #[arg(long, value_delimiter = ',', default_values_t = [0.0, 1.0, 2.0, 7.0, 10.0, 14.0, 50.0], value_name = "PERCENT")]
     pub(crate) tolerances: Vec<f64>,
     /// `tolerances`: also bitrees of these numbers of points, the four corners included, the largest errors first
     #[arg(long, value_delimiter = ',', value_name = "N")]
     pub(crate) points: Vec<usize>,
-    /// How the error of a triangle is told
+    /// `tolerances`, `strips`, `zone`: how the error of a triangle is told
     #[arg(long, value_enum, default_value_t = Criterion::Vertical)]
     pub(crate) criterion: Criterion,
-    /// Weights of samples: a raster of numbers from 0 to 1 on the DEM's own grid; no data counts as 0
+    /// `tolerances`, `strips`, `curvature`: weights of samples: a raster of numbers from 0 to 1 on the DEM's own grid; no data counts as 0
     #[arg(long, value_name = "RASTER")]
     pub(crate) mask: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) flights: lod::Options,
     #[command(flatten)]
     pub(crate) zone: by_zone::Options,
-    /// Where the observer stands, in samples from the window's south-west corner [default: the highest of its southern eighth]
+    /// `curvature`: where the observer stands, in samples from the window's south-west corner [default: the highest of its southern eighth]
     #[arg(long, value_name = "X,Y", value_parser = windows::parse_place)]
     pub(crate) observer: Option<Point>,
-    /// Metres of the observer's eye above the ground
+    /// `curvature`, `zone`: metres of the observer's eye above the ground
     #[arg(long, default_value_t = 50.0, value_name = "METRES")]
     pub(crate) eye: f64,
-    /// How much distance forgives: a in T (a d / D + 1)
+    /// `curvature`: how much distance forgives: a in T (a d / D + 1)
     #[arg(long, default_value_t = 20.0, value_name = "A")]
     pub(crate) forgiveness: f64,
 }
@@ -100,39 +101,67 @@ pub struct Experiment {
     pub name: &'static str,
     /// What it shows.
     pub about: &'static str,
+    /// The options that it heeds, by their identifiers.
+    takes: &'static [&'static str],
     work: Work,
 }
+
+impl Experiment {
+    /// Whether it heeds an option.
+    fn takes(&self, option: &str) -> bool {
+        self.takes.contains(&option) || matches!(self.work, Work::Windows(_)) && WINDOWS.contains(&option)
+    }
+}
+
+/// The options of all that work on windows.
+const WINDOWS: [&str; 3] = ["samples", "windows", "at"];
 
 /// All there are.
 pub const ALL: &[Experiment] = &[
     Experiment {
         name: "tolerances",
         about: "points, triangles and strips of bitree and restricted quadtree within tolerances",
+        takes: &["tolerances", "points", "criterion", "mask"],
         work: Work::Windows(tolerances::run),
     },
     Experiment {
         name: "strips",
         about: "references of triangle strips beside separate triangles and other orders",
+        takes: &["tolerances", "criterion", "mask"],
         work: Work::Windows(strips::run),
     },
     Experiment {
         name: "lod",
         about: "bytes and triangles of flights with each term of the client's level of detail on and off",
+        takes: &["error_pixels", "frames", "foveation"],
         work: Work::Whole(lod::run),
     },
     Experiment {
         name: "curvature",
         about: "polygons by local curvature, and the pixels that an observer sees change",
+        takes: &["mask", "observer", "eye", "forgiveness"],
         work: Work::Windows(by_curvature::run),
     },
     Experiment {
         name: "zone",
         about: "what is seen from a region, what its mask saves, and whether the skyline stays",
+        takes: &[
+            "tolerances",
+            "criterion",
+            "polygon",
+            "coordinates",
+            "hidden",
+            "angle",
+            "epsilon",
+            "spacing",
+            "eye",
+        ],
         work: Work::Windows(by_zone::run),
     },
     Experiment {
         name: "progressive",
         about: "errors against points and bytes: by level, tolerance, error; quadtree, points payloads, raster",
+        takes: &[],
         work: Work::Windows(progressive::run),
     },
 ];
@@ -158,6 +187,16 @@ pub enum ExperimentError {
         expected: String,
         /// What was given.
         found: String,
+    },
+    /// An option would change nothing.
+    #[error("--{option}: '{name}' does not heed it; leave it out, or run {heeding}")]
+    Ignored {
+        /// Which, without the dashes.
+        option: String,
+        /// The experiment.
+        name: &'static str,
+        /// Those that heed it.
+        heeding: String,
     },
     /// A result cannot be written.
     #[error("{}: cannot write: {source}; name another folder with -o", path.display())]
@@ -220,6 +259,29 @@ pub fn run(
     }
 }
 
+/// Refuses options that were given to an experiment which heeds them not: `matches` are of a command with [`Options`].
+///
+/// # Errors
+/// Names the first of them, and who heeds it.
+pub fn refuse_ignored(name: &str, matches: &clap::ArgMatches) -> Result<(), ExperimentError> {
+    let unknown = || ExperimentError::Unknown { found: name.to_owned() };
+    let experiment = ALL.iter().find(|e| e.name == name).ok_or_else(unknown)?;
+    let command = <Options as clap::Args>::augment_args(clap::Command::new(""));
+    for argument in command.get_arguments() {
+        let id = argument.get_id().as_str();
+        let is_given = matches.value_source(id) == Some(ValueSource::CommandLine);
+        if is_given && !experiment.takes(id) {
+            let heeding = ALL.iter().filter(|e| e.takes(id)).map(|e| e.name).collect::<Vec<_>>().join(", ");
+            return Err(ExperimentError::Ignored {
+                option: argument.get_long().unwrap_or(id).to_owned(),
+                name: experiment.name,
+                heeding,
+            });
+        }
+    }
+    Ok(())
+}
+
 /// Refuses options that make no sense for any DEM.
 fn check(options: &Options) -> Result<(), ExperimentError> {
     let wrong = |option, expected: &str, found: &dyn std::fmt::Display| {
@@ -255,4 +317,33 @@ fn mean_and_spread(values: &[f64]) -> [f64; 2] {
     let mean = values.iter().sum::<f64>() / n;
     let squares: f64 = values.iter().map(|v| (v - mean) * (v - mean)).sum();
     [mean, if values.len() < 2 { 0.0 } else { (squares / (n - 1.0)).sqrt() }]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_option_is_heeded_by_some_and_refused_by_the_others() {
+        let command = <Options as clap::Args>::augment_args(clap::Command::new("").no_binary_name(true));
+        let known: Vec<&str> = command.get_arguments().map(|a| a.get_id().as_str()).collect();
+        assert!(known.iter().all(|id| ALL.iter().any(|e| e.takes(id))), "{known:?}");
+        assert!(ALL.iter().flat_map(|e| e.takes).all(|id| known.contains(id)));
+        let refused = |name: &str, words: &[&str]| {
+            let matches = command.clone().try_get_matches_from(words).unwrap();
+            refuse_ignored(name, &matches).err().map(|e| e.to_string())
+        };
+        assert_eq!(refused("tolerances", &[]), None);
+        assert_eq!(
+            refused("tolerances", &["--samples", "33", "--points", "9", "--criterion", "normal"]),
+            None
+        );
+        let told = refused("progressive", &["--samples", "33", "--tolerances", "1"]).unwrap();
+        assert!(told.starts_with("--tolerances: 'progressive' does not heed it"), "{told}");
+        assert!(told.contains("tolerances, strips, zone"), "{told}");
+        assert!(refused("lod", &["--samples", "65"]).unwrap().contains("--samples"));
+        // A default is nothing that was given.
+        assert_eq!(refused("curvature", &["--eye", "10"]), None);
+        assert!(refused("strips", &["--eye", "50"]).is_some());
+    }
 }

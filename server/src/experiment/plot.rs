@@ -1,12 +1,14 @@
-//! Plots as SVG: lines with points over one axis, and meshes.
+//! Plots: lines with points over one axis, as SVG; and meshes, as PNG, since they may have a million triangles.
 
 use super::ExperimentError;
 use diamantina_protocol::bintree::Point;
 use plotters::prelude::{
     ChartBuilder, Circle, Color, IntoDrawingArea, LineSeries, Palette, Palette99, PathElement, SVGBackend,
-    SeriesLabelPosition, WHITE,
+    Text, WHITE,
 };
-use std::fmt::Write as _;
+
+/// Points of a line that are dotted at most.
+const DOTTED_MAX: usize = 60;
 
 /// A line of a plot.
 #[derive(Debug, Clone)]
@@ -51,8 +53,10 @@ pub fn lines(
     let mut text = String::new();
     let failed = |e: &dyn std::fmt::Display| ExperimentError::Plot(e.to_string());
     {
-        let area = SVGBackend::with_string(&mut text, (860, 520)).into_drawing_area();
-        area.fill(&WHITE).map_err(|e| failed(&e))?;
+        let whole = SVGBackend::with_string(&mut text, (1060, 520)).into_drawing_area();
+        whole.fill(&WHITE).map_err(|e| failed(&e))?;
+        // Names stand beside the plot: within it they would cover data.
+        let (area, names) = whole.split_horizontally(860);
         let (x, y) = (span(all().map(|p| p.0).collect()), span(all().map(|p| p.1).collect()));
         let mut chart = ChartBuilder::on(&area)
             .caption(title, ("sans-serif", 20))
@@ -67,43 +71,62 @@ pub fn lines(
         for (i, (name, points)) in series.iter().enumerate() {
             let colour = Palette99::pick(i).to_rgba();
             let line = LineSeries::new(points.iter().copied(), colour.stroke_width(2));
-            let drawn = chart.draw_series(line).map_err(|e| failed(&e))?;
-            drawn
-                .label(name)
-                .legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], colour.stroke_width(2)));
-            let dots = points.iter().map(|p| Circle::new(*p, 3, colour.filled()));
+            chart.draw_series(line).map_err(|e| failed(&e))?;
+            let y = 60 + 22 * i32::try_from(i).unwrap_or(i32::MAX / 22 - 60);
+            let stroke = PathElement::new([(0, y), (22, y)], colour.stroke_width(3));
+            names.draw(&stroke).map_err(|e| failed(&e))?;
+            let label = Text::new(name.clone(), (28, y - 7), ("sans-serif", 14));
+            names.draw(&label).map_err(|e| failed(&e))?;
+            // Of many points dots would hide the line.
+            let dotted = points.iter().take(if points.len() > DOTTED_MAX { 0 } else { points.len() });
+            let dots = dotted.map(|p| Circle::new(*p, 3, colour.filled()));
             chart.draw_series(dots).map_err(|e| failed(&e))?;
         }
-        let mut legend = chart.configure_series_labels();
-        // Errors fall with what was sent.
-        legend.position(if is_log {
-            SeriesLabelPosition::LowerLeft
-        } else {
-            SeriesLabelPosition::UpperRight
-        });
-        legend.background_style(WHITE.mix(0.8)).border_style(Palette99::pick(7).mix(0.3));
-        legend.label_font(("sans-serif", 14)).draw().map_err(|e| failed(&e))?;
-        area.present().map_err(|e| failed(&e))?;
+        whole.present().map_err(|e| failed(&e))?;
     }
     Ok(text.into_bytes())
 }
 
-/// A mesh seen from above: the sides of triangles on a grid of `side` cells, north up.
-#[must_use]
-pub fn mesh(side: u32, triangles: &[[Point; 3]]) -> Vec<u8> {
-    let mut text = format!(
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"-1 -1 {0} {0}\" width=\"900\" height=\"900\">\
-         <rect x=\"-1\" y=\"-1\" width=\"{0}\" height=\"{0}\" fill=\"white\"/>\
-         <path fill=\"none\" stroke=\"#234\" stroke-width=\"{1}\" stroke-linejoin=\"round\" d=\"",
-        side + 2,
-        f64::from(side) / 1500.0
-    );
+/// Pixels along a side of a mesh's picture, about.
+const MESH_PIXELS: u32 = 2048;
+
+/// A mesh seen from above: the sides of triangles on a grid of `side` cells, north up, as PNG.
+///
+/// # Errors
+/// Never in practice: it is written to memory.
+pub fn mesh(side: u32, triangles: &[[Point; 3]]) -> Result<Vec<u8>, png::EncodingError> {
+    let scale = (MESH_PIXELS / side).max(1);
+    let size = (side * scale + 1) as usize;
+    let mut pixels = vec![255u8; size * size];
     for [a, c, b] in triangles {
-        // Writing to a string does not fail.
-        let at = |p: &Point| [p[0], side - p[1]];
-        let ([ax, ay], [cx, cy], [bx, by]) = (at(a), at(c), at(b));
-        let _ = write!(text, "M{ax} {ay}L{cx} {cy}L{bx} {by}Z");
+        for [from, to] in [[a, c], [c, b], [b, a]] {
+            let [from, to] = [from, to].map(|p| [p[0] * scale, (side - p[1]) * scale]);
+            let steps = from[0].abs_diff(to[0]).max(from[1].abs_diff(to[1])).max(1);
+            for i in 0..=steps {
+                // Sides run along rows, columns and diagonals, so this is exact.
+                let [x, y] = [0, 1].map(|k| ((from[k] * (steps - i) + to[k] * i) / steps) as usize);
+                pixels[y * size + x] = 40;
+            }
+        }
     }
-    text.push_str("\"/></svg>\n");
-    text.into_bytes()
+    super::view::encoded([size; 2], png::ColorType::Grayscale, &pixels)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_mesh_of_pixels_has_its_sides_and_nothing_else() {
+        let bytes = mesh(1024, &[[[0, 0], [1024, 0], [1024, 1024]]]).unwrap();
+        let mut reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();
+        let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+        let info = reader.next_frame(&mut pixels).unwrap();
+        assert_eq!([info.width, info.height], [2049; 2]);
+        let row = |y: usize| &pixels[y * 2049..(y + 1) * 2049];
+        // North is up: the southern side is the last row, the eastern the last column; the third is a diagonal.
+        assert!(row(2048).iter().all(|p| *p == 40));
+        assert!((0..2049).all(|y| row(y)[2048] == 40 && row(y)[2048 - y] == 40));
+        assert!((0..2048).all(|y| row(y).iter().filter(|p| **p == 40).count() == 1 + usize::from(y > 0)));
+    }
 }

@@ -91,8 +91,20 @@ fn apexes(log2: u8, [x, y]: Point, s: u32, side: u32) -> [Option<Point>; 2] {
 /// is more than `tolerance` (it may stop counting beyond that), and whatever they depend on. All heights are samples'; no smaller
 /// quadtree holds every triangle within the tolerance.
 pub fn select(field: &Field, tolerance: f64, error: impl Fn(&Facet, f64) -> f64) -> Bitree {
+    complete(field, &field.tree(), tolerance, error)
+}
+
+/// The smallest quadtree within the tolerance that has all points of a selection. A selection that is within it by
+/// itself may leave it when it is closed, as the points that it depends on move the surface; then more have to split.
+pub fn complete(
+    field: &Field,
+    selected: &Bitree,
+    tolerance: f64,
+    error: impl Fn(&Facet, f64) -> f64,
+) -> Bitree {
     let full = field.full_tree();
-    let mut wanted = vec![false; field.heights().len()];
+    let is_selected = |slot: usize| selected.real(field.point(slot)).is_some();
+    let mut wanted = closure(field, (0..field.heights().len()).map(is_selected).collect());
     let mut open = full.roots().to_vec();
     while let Some(facet) = open.pop() {
         if !full.is_split(&facet) {
@@ -104,7 +116,7 @@ pub fn select(field: &Field, tolerance: f64, error: impl Fn(&Facet, f64) -> f64)
             force(field, &full, facet.middle(), &mut wanted, &mut open);
         }
     }
-    let mut tree = field.tree();
+    let mut tree = selected.clone();
     for slot in (0..wanted.len()).filter(|slot| wanted[*slot]) {
         tree.add(field.point(slot), field.heights()[slot]);
     }

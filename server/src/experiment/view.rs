@@ -31,6 +31,8 @@ pub struct View {
 pub const SIZE: [usize; 2] = [690, 384];
 /// Tangent of half the angle across: 60 degrees.
 const HALF_ANGLE: f64 = 0.577;
+/// Shades of 255 up to which a pixel counts as the same.
+const CHANGED: u8 = 8;
 /// Light from the north-west, half-way up.
 const LIGHT: [f64; 3] = [-0.5, 0.5, 0.707];
 
@@ -142,8 +144,21 @@ pub(super) fn shade([east, north]: [f64; 2], distance: f64) -> u8 {
 pub fn difference(a: &View, b: &View) -> [f64; 2] {
     let n = a.pixels.len() as f64;
     let apart = || a.pixels.iter().zip(&b.pixels).map(|(p, q)| p.abs_diff(*q));
-    let changed = apart().filter(|d| *d > 8).count() as f64;
+    let changed = apart().filter(|d| *d > CHANGED).count() as f64;
     [100.0 * changed / n, apart().map(f64::from).sum::<f64>() / n]
+}
+
+/// The first picture, paler, with red where the second differs by more than 8 of 255 shades, as PNG.
+///
+/// # Errors
+/// Never in practice: it is written to memory.
+pub fn changes(a: &View, b: &View) -> Result<Vec<u8>, png::EncodingError> {
+    let pixel = |(p, q): (&u8, &u8)| {
+        let pale = 128 + p / 2;
+        if p.abs_diff(*q) > CHANGED { [200, 0, 0] } else { [pale; 3] }
+    };
+    let pixels: Vec<u8> = a.pixels.iter().zip(&b.pixels).flat_map(pixel).collect();
+    encoded(SIZE, png::ColorType::Rgb, &pixels)
 }
 
 /// The picture as PNG.
@@ -151,12 +166,21 @@ pub fn difference(a: &View, b: &View) -> [f64; 2] {
 /// # Errors
 /// Never in practice: it is written to memory.
 pub fn png(view: &View) -> Result<Vec<u8>, png::EncodingError> {
+    encoded(SIZE, png::ColorType::Grayscale, &view.pixels)
+}
+
+/// Pixels of a byte a channel as PNG, rows from the top.
+pub(super) fn encoded(
+    size: [usize; 2],
+    colour: png::ColorType,
+    pixels: &[u8],
+) -> Result<Vec<u8>, png::EncodingError> {
     let mut bytes = Vec::new();
-    let [width, height] = SIZE.map(|v| u32::try_from(v).unwrap_or(u32::MAX));
+    let [width, height] = size.map(|v| u32::try_from(v).unwrap_or(u32::MAX));
     let mut encoder = png::Encoder::new(&mut bytes, width, height);
-    encoder.set_color(png::ColorType::Grayscale);
+    encoder.set_color(colour);
     encoder.set_depth(png::BitDepth::Eight);
-    encoder.write_header()?.write_image_data(&view.pixels)?;
+    encoder.write_header()?.write_image_data(pixels)?;
     Ok(bytes)
 }
 

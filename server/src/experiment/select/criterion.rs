@@ -38,6 +38,11 @@ impl<'a> Ground<'a> {
         Self { field: self.field, weights: None, curvatures: OnceLock::new(), full: OnceLock::new() }
     }
 
+    /// Whether every sample has data and counts fully.
+    pub(super) fn counts_all(&self) -> bool {
+        self.weights.is_none() && self.field.samples() == self.field.heights().len()
+    }
+
     fn weight(&self, slot: usize) -> f64 {
         self.weights.map_or(1.0, |w| f64::from(w[slot]))
     }
@@ -88,6 +93,12 @@ impl Criterion {
     #[must_use]
     pub fn is_measured(self) -> bool {
         !matches!(self, Self::Curvature | Self::Coefficient)
+    }
+
+    /// Whether a triangle splits at a middle that lies on its hypotenuse, too: sums over the triangle fall with its area,
+    /// whatever its heights.
+    pub(super) fn splits_level(self) -> bool {
+        self == Self::Curvature
     }
 
     /// How far a sample counts as off the surface, if errors are distances: upright, which is never less than
@@ -153,14 +164,20 @@ fn normal_error(ground: &Ground<'_>, facet: &Facet, enough: f64) -> f64 {
             let corners = finest.corners();
             if corners.iter().all(|p| !field.at(*p).is_nan()) {
                 let other = unit_normal(slopes(field, finest));
-                let cosine: f64 = own.iter().zip(other).map(|(a, b)| a * b).sum();
                 let weight = corners.iter().map(|p| ground.weight(field.slot(*p))).fold(0.0, f64::max);
-                worst = worst.max(weight * cosine.min(1.0).acos().to_degrees());
+                worst = worst.max(weight * angle(own, other).to_degrees());
             }
             if worst > enough { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         });
     }
     worst
+}
+
+/// Between two unit vectors. By the sine as well as by the cosine, which for small angles is all rounding.
+fn angle(a: [f64; 3], b: [f64; 3]) -> f64 {
+    let cross = [0, 1, 2].map(|i| a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3]);
+    let cosine: f64 = a.iter().zip(b).map(|(a, b)| a * b).sum();
+    cross.iter().map(|w| w * w).sum::<f64>().sqrt().atan2(cosine)
 }
 
 fn unit_normal([sx, sy]: [f64; 2]) -> [f64; 3] {

@@ -80,7 +80,8 @@ pub fn greedy(
             continue;
         }
         let (point, off) = farthest(ground, criterion, &facet);
-        if off > share * error || (off > 0.0 && criterion.distance(ground, 0, 1.0).is_none()) {
+        let is_level = off == 0.0 && criterion.splits_level() && !field.at(point).is_nan();
+        if is_level || off > share * error || (off > 0.0 && criterion.distance(ground, 0, 1.0).is_none()) {
             tree.add(point, field.at(point));
             points += 1;
             for half in tree.around(point).into_iter().flatten().flat_map(|t| tree.halves(&t)) {
@@ -95,7 +96,7 @@ pub fn greedy(
     tree
 }
 
-/// Of the middle and the corners of a triangle, the point whose sample is farthest off the surface.
+/// Of the middle and the corners of a triangle, the point whose sample is farthest off the surface; the middle if none is.
 fn farthest(ground: &Ground<'_>, criterion: Criterion, facet: &Facet) -> (Point, f64) {
     let field = ground.field();
     let [ha, _, hb] = facet.heights();

@@ -69,9 +69,10 @@ pub fn by_strategy(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, st
         Strategy::Greedy => (refine(ground.field().tree()), None),
         Strategy::Direct => (criterion.direct(ground, tolerance), None),
     };
-    if criterion == Criterion::Euclidean {
+    if matches!(criterion, Criterion::Euclidean | Criterion::Normal) && strategy != Strategy::Greedy {
         // A fictitious corner is near a steep triangle's plane, and too far from a flatter one's that a point
-        // beside it made later: then the corner itself has to become real, which no descent does.
+        // beside it made later; and it tilts the finest triangles. Then the corner itself has to become real, which
+        // no descent does.
         (tree, may_go) = (refine(tree), None);
     }
     if strategy != Strategy::Direct && criterion.is_measured() {
@@ -84,11 +85,14 @@ pub fn by_strategy(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, st
 }
 
 /// The better of a selection from the top and a greedy one: fewer points, then fewer triangles. Coefficients
-/// know only one way.
+/// know only one way; and without any tolerance on heights every way finds the same points, those that are off.
 #[must_use]
 pub fn select(ground: &Ground<'_>, criterion: Criterion, tolerance: f64) -> (Bitree, Strategy) {
     if criterion == Criterion::Coefficient {
         return (by_strategy(ground, criterion, tolerance, Strategy::Direct), Strategy::Direct);
+    }
+    if criterion == Criterion::Vertical && tolerance == 0.0 && ground.counts_all() {
+        return (by_strategy(ground, criterion, tolerance, Strategy::Compact), Strategy::Compact);
     }
     let size = |tree: &Bitree| (tree.points().0, tree.triangle_count());
     let [first, second] = [Strategy::Compact, Strategy::Greedy]

@@ -32,6 +32,9 @@ pub(super) fn prune_among(
         may_go.sort_unstable_by_key(|p| (std::cmp::Reverse(tree.level(*p)), p[1], p[0]));
         let mut removed = 0;
         for point in may_go {
+            if has_to_stay(ground, criterion, tolerance, tree, point) {
+                continue;
+            }
             let Some(height) = tree.remove(point) else { continue };
             if is_good(ground, criterion, tolerance, tree, point) {
                 removed += 1;
@@ -44,6 +47,21 @@ pub(super) fn prune_among(
         }
         may_go = all(ground, tree);
     }
+}
+
+/// Whether a point's own sample would be off by more than the tolerance without it: told at once, and true of most.
+fn has_to_stay(
+    ground: &Ground<'_>,
+    criterion: Criterion,
+    tolerance: f64,
+    tree: &Bitree,
+    point: Point,
+) -> bool {
+    let Some(facet) = tree.around(point).into_iter().flatten().next() else { return false };
+    let [ha, _, hb] = facet.heights();
+    let off = ground.field().at(point) - (ha + hb) / 2.0;
+    criterion == Criterion::Vertical
+        && criterion.distance(ground, ground.field().slot(point), off) > Some(tolerance)
 }
 
 /// Every real point; the corners, which always stay, do no harm.

@@ -84,19 +84,40 @@ proptest! {
         let vertical = |facet: &diamantina_protocol::bitree::Facet, enough: f64| Criterion::Vertical.error(&ground, facet, enough);
         let quadtree = quadtree::select(&field, tolerance, vertical);
         prop_assert!(largest_error(&ground, Criterion::Vertical, &quadtree) <= tolerance);
+        // So does the closure of a bitree's points, with what brings it back.
+        let tree = by_strategy(&ground, Criterion::Vertical, tolerance, Strategy::Compact);
+        let closed = quadtree::complete(&field, &tree, tolerance, vertical);
+        prop_assert!(largest_error(&ground, Criterion::Vertical, &closed) <= tolerance);
+        for slot in 0..SIDE * SIDE {
+            let p = field.point(slot);
+            prop_assert!(tree.real(p).is_none_or(|height| closed.real(p) == Some(height)));
+        }
+    }
+
+    #[test]
+    fn criteria_that_are_no_distances_are_kept_too(field in any_field(), part in 0.0f64..0.6) {
+        // Where samples have no data, triangles may be left that cannot split.
+        prop_assume!(field.samples() == SIDE * SIDE);
+        let ground = Ground::new(&field, None).unwrap();
+        for criterion in [Criterion::Curvature, Criterion::Normal] {
+            let tolerance = part * scale(&ground, criterion);
+            for strategy in [Strategy::Compact, Strategy::Sparse, Strategy::Greedy] {
+                let tree = by_strategy(&ground, criterion, tolerance, strategy);
+                let found = largest_error(&ground, criterion, &tree);
+                prop_assert!(found <= tolerance, "{criterion:?} {strategy} {found} {tolerance}");
+            }
+        }
     }
 
     #[test]
     fn points_that_are_not_tried_again_would_have_stayed(field in any_field(), part in 0.0f64..0.6, masked in any::<bool>()) {
         let weights: Vec<f32> = (0..SIDE * SIDE).map(|s| [1.0, 0.25, 0.0][s % 3]).collect();
         let ground = Ground::new(&field, masked.then_some(&weights[..])).unwrap();
-        for criterion in [Criterion::Vertical, Criterion::Normal] {
-            let tolerance = part * scale(&ground, criterion);
-            for (strategy, share) in [(Strategy::Compact, 0.0), (Strategy::Sparse, 1.0)] {
-                let mut tried = top_down(&ground, criterion, tolerance, share);
-                prune(&ground, criterion, tolerance, &mut tried);
-                prop_assert!(by_strategy(&ground, criterion, tolerance, strategy) == tried, "{strategy} {criterion:?}");
-            }
+        let (criterion, tolerance) = (Criterion::Vertical, part * field.relief());
+        for (strategy, share) in [(Strategy::Compact, 0.0), (Strategy::Sparse, 1.0)] {
+            let mut tried = top_down(&ground, criterion, tolerance, share);
+            prune(&ground, criterion, tolerance, &mut tried);
+            prop_assert!(by_strategy(&ground, criterion, tolerance, strategy) == tried, "{strategy}");
         }
     }
 
@@ -107,7 +128,9 @@ proptest! {
         let ground = Ground::new(&field, None).unwrap();
         let tree = by_strategy(&ground, Criterion::Vertical, 0.0, Strategy::Compact);
         prop_assert!(by_strategy(&ground, Criterion::Coefficient, 0.0, Strategy::Direct) == tree);
-        prop_assert!(by_strategy(&ground, Criterion::Vertical, 0.0, Strategy::Sparse) == tree);
+        for strategy in [Strategy::Sparse, Strategy::Greedy] {
+            prop_assert!(by_strategy(&ground, Criterion::Vertical, 0.0, strategy) == tree, "{strategy}");
+        }
     }
 
     #[test]

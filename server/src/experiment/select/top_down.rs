@@ -26,7 +26,7 @@ impl Queued {
 }
 
 /// The points of a descent; middles that are off by no more than `share` of the tolerance stay fictitious. By criteria
-/// that are no distances each middle that is off at all is real. Every triangle is within the tolerance
+/// that are no distances each middle that is off at all is real, by sums any. Every triangle is within the tolerance
 /// afterwards, down to the finest ones, which cannot split.
 #[must_use]
 pub fn top_down(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, share: f64) -> Bitree {
@@ -68,7 +68,7 @@ pub(super) fn descend(
             let distance = criterion.distance(ground, field.slot(m), off);
             let is_off = match distance {
                 Some(distance) => distance > share * tolerance,
-                None => off != 0.0,
+                None => off != 0.0 || criterion.splits_level(),
             };
             if is_off && !off.is_nan() && draft.add(m, field.at(m)).is_none() {
                 if criterion != Criterion::Vertical || distance <= Some(tolerance) {
