@@ -15,7 +15,7 @@
 //!
 //! This is the unrestricted hierarchical triangulation of the bitree paper (dependencies of real and
 //! fictitious points, its section 2.2). Heights are `f64`: a mean halves, so sums of 24-bit heights over
-//! the 48 levels at most stay exact, and the same everywhere.
+//! the 24 levels at most stay exact, and the same everywhere.
 //!
 //! [`Bitree::triangles`] lists triangles, [`Bitree::triangles_closed`] also those that close T-junctions;
 //! [`strip`] has the references of a triangle strip.

@@ -2,8 +2,9 @@
 //! sees of the difference.
 //!
 //! For each share of the polygons of the full grid the threshold is found by bisection, since thresholds mean
-//! nothing by themselves. The mask is the one given, or what the observer sees of the full field: every sample
-//! that some pixel shows, and its neighbours.
+//! nothing by themselves. The mask is the one given, or what the observer's picture shows of the full field: every
+//! sample that some pixel shows, and its neighbours. *All around* is the same of pictures in all directions, for an
+//! observer who turns: the change is still counted in the one picture.
 
 use super::curvature::quadtree::{Observer, Quadtree, Sums};
 use super::curvature::templates;
@@ -18,6 +19,8 @@ use diamantina_protocol::bintree::Point;
 const SHARES: [f64; 6] = [50.0, 20.0, 10.0, 7.0, 5.0, 2.0];
 /// The shares that are pictured: between them lies what an observer begins to notice.
 const PICTURED: [f64; 2] = [10.0, 5.0];
+/// Pictures that together show all around: each is 60 degrees wide.
+const DIRECTIONS: u32 = 6;
 /// Halvings of the interval of a threshold's logarithm; the last are finer than any polygon.
 const BISECTIONS: usize = 40;
 
@@ -36,7 +39,7 @@ const COLUMNS: [&str; 9] = [
 pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     let mut table = Table::new("curvature", "Polygons by curvature and what the observer sees", &COLUMNS);
     let mut pictures = Vec::new();
-    run.progress.stage("splitting", "meshes", (run.windows.len() * SHARES.len() * 4) as u64, 0);
+    run.progress.stage("splitting", "meshes", (run.windows.len() * SHARES.len() * 5) as u64, 0);
     for (i, window) in run.windows.iter().enumerate() {
         one(run, i, window, &mut table, &mut pictures)?;
     }
@@ -71,11 +74,13 @@ fn one(
     let eye = eye(run, field);
     let full = view::render(field, field.heights(), eye);
     let mask = window.weights.clone().unwrap_or_else(|| grown(field, &full.seen));
+    let around = grown(field, &seen_around(field, eye));
     let observer = Observer { at: eye.at, forgiveness: run.options.forgiveness };
     let rules = [
         Rule { name: "plain", sums: Sums::new(field, None), observer: None },
         Rule { name: "view", sums: Sums::new(field, None), observer: Some(observer) },
         Rule { name: "mask", sums: Sums::new(field, Some(&mask)), observer: None },
+        Rule { name: "view and all around", sums: Sums::new(field, Some(&around)), observer: Some(observer) },
         Rule { name: "view and mask", sums: Sums::new(field, Some(&mask)), observer: Some(observer) },
     ];
     let mut series = Vec::new();
@@ -178,6 +183,21 @@ fn rms(field: &Field, surface: &[f64]) -> f64 {
     let squares = field.heights().iter().zip(surface).map(|(a, b)| (a - b) * (a - b)).filter(|s| !s.is_nan());
     let (sum, n) = squares.fold((0.0, 0u32), |(sum, n), s| (sum + s, n + 1));
     (sum / f64::from(n.max(1))).sqrt()
+}
+
+/// What is seen from an eye in all directions.
+fn seen_around(field: &Field, eye: Eye) -> Vec<bool> {
+    let [dx, dy] = field.cell();
+    let ahead = [(eye.towards[0] - eye.at[0]) * dx, (eye.towards[1] - eye.at[1]) * dy];
+    let mut seen = vec![false; field.heights().len()];
+    for i in 0..DIRECTIONS {
+        let (sine, cosine) = (f64::from(i) / f64::from(DIRECTIONS) * std::f64::consts::TAU).sin_cos();
+        let turned = [ahead[0] * cosine - ahead[1] * sine, ahead[0] * sine + ahead[1] * cosine];
+        let towards = [eye.at[0] + turned[0] / dx, eye.at[1] + turned[1] / dy];
+        let view = view::render(field, field.heights(), Eye { towards, ..eye });
+        seen.iter_mut().zip(view.seen).for_each(|(seen, here)| *seen |= here);
+    }
+    seen
 }
 
 /// What is seen and one sample around it.

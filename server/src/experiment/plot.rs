@@ -103,7 +103,7 @@ pub fn mesh(side: u32, triangles: &[[Point; 3]]) -> Result<Vec<u8>, png::Encodin
             let [from, to] = [from, to].map(|p| [p[0] * scale, (side - p[1]) * scale]);
             let steps = from[0].abs_diff(to[0]).max(from[1].abs_diff(to[1])).max(1);
             for i in 0..=steps {
-                // Sides run along rows, columns and diagonals, so this is exact.
+                // Exact along rows, columns and diagonals, and the nearest pixel but one elsewhere.
                 let [x, y] = [0, 1].map(|k| ((from[k] * (steps - i) + to[k] * i) / steps) as usize);
                 pixels[y * size + x] = 40;
             }

@@ -58,8 +58,12 @@ fn outcome(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, strategy: 
     let bitree = by_strategy(ground, criterion, tolerance, strategy);
     let error = |facet: &Facet, enough: f64| criterion.error(ground, facet, enough);
     let closure = quadtree::close(field, &bitree).points().0;
-    let closed = quadtree::complete(field, &bitree, tolerance, error);
-    let own = quadtree::select(field, tolerance, error);
+    // Coefficients are of points by themselves: no triangle tells whether those below it have any.
+    let [closed, own] = if criterion == Criterion::Coefficient {
+        [quadtree::close(field, &bitree), quadtree::close(field, &bitree)]
+    } else {
+        [quadtree::complete(field, &bitree, tolerance, error), quadtree::select(field, tolerance, error)]
+    };
     let (real, fictitious) = bitree.points();
     let all = closed.points().0;
     Outcome {

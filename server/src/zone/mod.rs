@@ -56,7 +56,7 @@ pub const SPACING_CELLS: f64 = 4.0;
 pub const EYES: f64 = 200.0;
 
 /// The most eyes, however told.
-const EYES_MAX: usize = 1 << 16;
+pub(crate) const EYES_MAX: usize = 1 << 16;
 
 /// Bytes of memory for a sample: its height, its share of the blocks, its visibility.
 const SAMPLE_BYTES: f64 = 5.8;

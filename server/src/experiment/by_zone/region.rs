@@ -9,7 +9,7 @@ use crate::zone::polygon::{self, contour, perimeter};
 use crate::zone::relief::Relief;
 use crate::zone::tiled::Tiled;
 use crate::zone::view::Ground;
-use crate::zone::{EYES, SPACING_CELLS};
+use crate::zone::{EYES, EYES_MAX, SPACING_CELLS};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Point;
 use std::path::Path;
@@ -71,6 +71,13 @@ pub(super) fn from_polygon(
     let cell = ground.cell[0].min(ground.cell[1]);
     let around: f64 = polygons.iter().map(|rings| perimeter(rings)).sum();
     let spacing = run.options.zone.spacing.unwrap_or((SPACING_CELLS * cell).max(around / EYES));
+    if around / spacing > EYES_MAX as f64 {
+        return Err(ExperimentError::Options {
+            option: "--spacing",
+            expected: format!("more metres: at most {EYES_MAX} eyes along {around:.0} m of contour"),
+            found: spacing.to_string(),
+        });
+    }
     let (mut own, mut eyes) = (Vec::new(), Vec::new());
     for rings in &polygons {
         let Some(highest) = ground.highest(rings) else {

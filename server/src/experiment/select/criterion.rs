@@ -3,6 +3,7 @@
 use crate::experiment::curvature::curvatures;
 use crate::experiment::field::Field;
 use crate::experiment::scan::{Plane, rows, vertical_error};
+use diamantina_protocol::bintree::Point;
 use diamantina_protocol::bitree::{Bitree, Facet};
 use std::ops::ControlFlow;
 use std::sync::OnceLock;
@@ -56,7 +57,7 @@ pub enum Criterion {
     Vertical,
     /// The largest distance at right angles to the triangle's plane, metres.
     Euclidean,
-    /// The sum of the samples' curvatures: see [`crate::experiment::curvature`].
+    /// The sum of the samples' curvatures, as the changes of slope from sample to sample.
     Curvature,
     /// The largest angle between the triangle and the finest triangles that it stands for, degrees.
     Normal,
@@ -84,7 +85,8 @@ impl Criterion {
                 let m = facet.middle();
                 let [ha, _, hb] = facet.heights();
                 let off = (field.at(m) - (ha + hb) / 2.0).abs();
-                if off.is_nan() || facet.level() >= 2 * u32::from(field.log2()) { 0.0 } else { off }
+                let is_finest = facet.level() >= 2 * u32::from(field.log2());
+                if off.is_nan() || is_finest { 0.0 } else { ground.weight(field.slot(m)) * off }
             }
         }
     }
@@ -109,19 +111,37 @@ impl Criterion {
 
     /// The points whose coefficients are more than the tolerance; by another criterion, the corners alone.
     pub(super) fn direct(self, ground: &Ground<'_>, tolerance: f64) -> Bitree {
-        let field = ground.field;
-        let (full, mut tree) = (field.full_tree(), field.tree());
-        for slot in 0..field.heights().len() {
-            let point = field.point(slot);
-            if let Some(facet) = full.around(point).into_iter().flatten().next()
-                && self == Self::Coefficient
-                && ground.weight(slot) * self.error(ground, &facet, f64::INFINITY) > tolerance
-            {
-                tree.add(point, field.at(point));
+        let mut tree = ground.field.tree();
+        if self == Self::Coefficient {
+            for (_, point) in coefficients(ground).into_iter().filter(|(size, _)| *size > tolerance) {
+                tree.add(point, ground.field.at(point));
             }
         }
         tree
     }
+
+    /// The points with the largest coefficients, so many with the corners; `None` by another criterion.
+    pub(super) fn largest(self, ground: &Ground<'_>, points: usize) -> Option<Bitree> {
+        let mut tree = (self == Self::Coefficient).then(|| ground.field.tree())?;
+        let mut all = coefficients(ground);
+        all.sort_by(|(a, p), (b, q)| b.total_cmp(a).then([p[1], p[0]].cmp(&[q[1], q[0]])));
+        for (_, point) in all.into_iter().take(points.saturating_sub(4)).filter(|(size, _)| *size > 0.0) {
+            tree.add(point, ground.field.at(point));
+        }
+        Some(tree)
+    }
+}
+
+/// The weighted coefficient of each point that has one.
+fn coefficients(ground: &Ground<'_>) -> Vec<(f64, Point)> {
+    let field = ground.field;
+    let full = field.full_tree();
+    let of = |slot: usize| {
+        let point = field.point(slot);
+        let facet = full.around(point).into_iter().flatten().next()?;
+        Some((Criterion::Coefficient.error(ground, &facet, f64::INFINITY), point))
+    };
+    (0..field.heights().len()).filter_map(of).collect()
 }
 
 /// The vertical part of the unit normal of a triangle.

@@ -103,7 +103,8 @@ pub fn select(ground: &Ground<'_>, criterion: Criterion, tolerance: f64) -> (Bit
 /// At most `points` points, corners included, the largest errors first.
 #[must_use]
 pub fn by_number(ground: &Ground<'_>, criterion: Criterion, points: usize) -> Bitree {
-    greedy(ground, criterion, 0.0, GREEDY_SHARE, points, ground.field().tree())
+    let refined = || greedy(ground, criterion, 0.0, GREEDY_SHARE, points, ground.field().tree());
+    criterion.largest(ground, points).unwrap_or_else(refined)
 }
 
 /// What 100 % of a tolerance is by a criterion: of distances the relief, else the error of the corners' two triangles.

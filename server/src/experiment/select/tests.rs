@@ -174,6 +174,23 @@ fn each_criterion_sees_its_own_fault() {
 }
 
 #[test]
+fn coefficients_are_weighed_and_the_largest_come_first() {
+    let mut heights = vec![0.0; SIDE * SIDE];
+    for (slot, height) in [(16 * SIDE + 9, 50.0), (5 * SIDE + 21, 30.0), (27 * SIDE + 3, 10.0)] {
+        heights[slot] = height;
+    }
+    let field = Field::new(5, heights, [30.0, 30.0]).unwrap();
+    let first = |weights: Option<&[f32]>| {
+        let tree = by_number(&Ground::new(&field, weights).unwrap(), Criterion::Coefficient, 5);
+        [[9, 16], [21, 5], [3, 27]].map(|p| tree.real(p).is_some())
+    };
+    assert_eq!(first(None), [true, false, false]);
+    let mut mask = vec![1.0; SIDE * SIDE];
+    mask[16 * SIDE + 9] = 0.1;
+    assert_eq!(first(Some(&mask)), [false, true, false]);
+}
+
+#[test]
 fn a_tilted_plane_is_nearer_at_right_angles_than_upright() {
     let mut heights: Vec<f64> = (0..SIDE * SIDE).map(|s| (s % SIDE * 30) as f64).collect();
     heights[16 * SIDE + 16] += 10.0;
