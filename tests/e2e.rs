@@ -41,6 +41,8 @@ mod tin;
 mod triangles;
 /// Law 3: declared errors hold at every sample of real DEMs.
 mod truth;
+/// The viewer in a window of a virtual screen.
+mod window;
 /// The harness: synthetic DEM → store → server on a free port → client, and a network that misbehaves.
 mod world;
 /// Zones: computed, published, served; cheaper pictures from within, and the same skyline.

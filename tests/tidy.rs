@@ -59,8 +59,10 @@ const CLIENT: &[(&str, &[&str])] = &[
     ("cut", &["camera", "drawing", "encoding", "morph", "sight", "surface"]),
     ("terrain", &["cache", "camera", "cut", "drawing", "encoding", "fetch", "morph", "sight", "surface"]),
     ("render", &["camera", "drawing", "morph", "picture", "surface"]),
+    ("controls", &["camera"]),
+    ("pick", &["drawing", "surface"]),
     ("headless", &["camera", "fetch", "picture", "render", "surface", "terrain"]),
-    ("viewer", &["camera", "fetch", "headless", "render", "terrain"]),
+    ("viewer", &["camera", "controls", "drawing", "headless", "pick", "picture", "render", "terrain"]),
     ("web", &["viewer"]),
     // The made scene of the crate's own tests.
     ("world", &["camera", "drawing", "encoding", "surface"]),

@@ -10,25 +10,31 @@
 //! | [`encoding`] | points or irregular triangles: which of them is streamed |
 //! | [`surface`] | a decoded diamond: points with heights and slopes, or triangles with normals |
 //! | [`morph`] | how what is drawn moves from one cut to the next |
+//! | [`controls`] | moving the eye as people know it from maps and globes |
+//! | [`pick`] | what of the drawn terrain is under the cursor |
 //! | [`terrain`] | one frame of streaming: cut, fetch, decode, cache |
 //! | [`drawing`] | what a frame draws, as plain data |
 //! | [`render`] | drawing + camera → pixels; the only module that knows the GPU |
 //! | [`picture`] | pixels → PNG |
 //! | [`headless`] | pictures and flights without a window |
+//! | [`viewer`] | the terrain with a panel and a mouse; in a window |
 
 pub mod cache;
 pub mod camera;
+pub mod controls;
 pub mod cut;
 pub mod drawing;
 pub mod encoding;
 pub mod fetch;
 pub mod headless;
 pub mod morph;
+pub mod pick;
 pub mod picture;
 pub mod render;
 pub mod sight;
 pub mod surface;
 pub mod terrain;
+pub mod viewer;
 
 #[cfg(test)]
 #[allow(

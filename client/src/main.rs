@@ -9,6 +9,7 @@ use diamantina_client::morph;
 use diamantina_client::render::{self, Background, Colours, Look, Sun};
 use diamantina_client::sight::Sight;
 use diamantina_client::terrain::{self, Terrain, TerrainError};
+use diamantina_client::viewer::{self, Viewer};
 use diamantina_protocol::message::Scene;
 use glam::DVec3;
 use std::io::{IsTerminal, Write};
@@ -19,6 +20,9 @@ use std::time::Duration;
 
 /// What heights may be multiplied by.
 const EXAGGERATION: RangeInclusive<f64> = 0.01..=1000.0;
+
+/// Seconds that points move in a window.
+const MORPH_SECONDS: f64 = 0.3;
 
 /// Draws streamed terrain.
 #[derive(Parser)]
@@ -34,11 +38,23 @@ enum Command {
     Render(RenderArgs),
     /// Fly along a path while data stream in
     Fly(FlyArgs),
+    /// Look around in a window
+    View(ViewerArgs),
 }
 
 #[derive(Args)]
+struct ViewerArgs {
+    #[command(flatten)]
+    view: ViewArgs,
+    /// Seconds that points take to move where the level of detail changes [default: 0.3, and 0 for tin]
+    #[arg(long, value_name = "SECONDS")]
+    morph: Option<f64>,
+}
+
+#[derive(Args, Clone)]
 struct ViewArgs {
-    /// The server, or one of its scenes: http://HOST:PORT or http://HOST:PORT/scenes/NAME
+    /// The server, or one of its scenes: http://HOST:PORT or http://HOST:PORT/scenes/NAME; for `view` also with
+    /// #x,y,z,heading,pitch
     url: String,
     /// Width and height of the picture, in pixels
     #[arg(long, default_value = "1380x768", value_name = "WIDTHxHEIGHT", value_parser = parse_size)]
@@ -231,6 +247,7 @@ fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Render(args) => render(&args),
         Command::Fly(args) => fly(&args),
+        Command::View(args) => view(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -385,6 +402,31 @@ fn print_report(args: &RenderArgs, r: &PictureReport) -> std::io::Result<()> {
         "  {} triangles in {} draws, {:.0} ms a frame",
         r.triangles_drawn, r.draws, r.milliseconds_a_frame
     )
+}
+
+fn view(args: &ViewerArgs) -> Result<(), Failure> {
+    let morph = args.morph.unwrap_or(match args.view.encoding {
+        EncodingName::Points => MORPH_SECONDS,
+        EncodingName::Tin => 0.0,
+    });
+    if !(0.0..=morph::SECONDS_MAX).contains(&morph) {
+        let max = morph::SECONDS_MAX;
+        return Err(Failure(2, format!("--morph {morph}: expected seconds from 0 to {max}")));
+    }
+    let (url, at) = match args.view.url.split_once('#') {
+        Some((url, view)) => {
+            let expected = "expected #x,y,z,heading,pitch, metres and degrees, as `Copy view` gives it";
+            let camera = viewer::camera_at(view, args.view.size);
+            (url.to_owned(), Some(camera.ok_or_else(|| Failure(2, format!("#{view}: {expected}")))?))
+        }
+        None => (args.view.url.clone(), None),
+    };
+    let view = ViewArgs { url: url.clone(), ..args.view.clone() };
+    let terrain = view.open(morph)?;
+    let look = view.look(terrain.scene());
+    let title = format!("{} - Diamantina", terrain.scene().name);
+    let viewer = Viewer::new(terrain, &url, look, view.size, at);
+    viewer::window::run(viewer, &title, &view.options()).map_err(|e| Failure(1, e.to_string()))
 }
 
 fn fly(args: &FlyArgs) -> Result<(), Failure> {

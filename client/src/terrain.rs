@@ -342,6 +342,19 @@ impl Terrain {
         self.problem.as_deref()
     }
 
+    /// How far the triangles over a side of a split diamond may be off, in metres: the declared error of whatever would
+    /// split them further, or of the finest level. `None` where the index does not tell yet.
+    #[must_use]
+    pub fn error_metres(&self, layer: usize, diamond: Diamond, side: usize) -> Option<f64> {
+        let layer_is = self.scene.layers.get(layer)?;
+        let child = layer_is.forest.children(diamond).get(side).copied()?;
+        let error = match child {
+            Some(child) => self.layers[layer].index.get(child)?.error_metres,
+            None => layer_is.finest_error,
+        };
+        Some(f64::from(error))
+    }
+
     /// The error to reach, in pixels.
     #[must_use]
     pub fn tolerance_pixels(&self) -> f64 {

@@ -3,7 +3,6 @@
 //! | module | what it holds |
 //! |---|---|
 //! | `frame` | the uniforms, and how positions stay exact far from the origin |
-//! | `triangles` | which points of a diamond make its triangles |
 //! | `resident` | surfaces on the GPU, under a budget |
 //! | `offscreen` | pictures without a window |
 //!
@@ -15,7 +14,6 @@
 mod frame;
 mod offscreen;
 mod resident;
-mod triangles;
 
 #[cfg(test)]
 mod tests;

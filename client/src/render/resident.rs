@@ -4,10 +4,10 @@
 //! long as it moves, 20 bytes a point (166 kB). Irregular triangles take 16 bytes a vertex and 6 a triangle. The lines
 //! around triangles, once they are drawn, take twice as much as their index lists. Those that the present frame draws always stay; of the others, the longest unseen go first.
 
-use super::triangles::{self, Form, Lists};
 use crate::camera::Bounds;
 use crate::drawing::DrawItem;
 use crate::morph::Motion;
+use crate::surface::triangles::{self, Form, Lists};
 use crate::surface::{Points, Surface, Tin, normal};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::Diamond;

@@ -5,6 +5,7 @@
 
 mod points;
 mod tin;
+pub(crate) mod triangles;
 
 pub use points::Points;
 pub use tin::{Corner, Tin};

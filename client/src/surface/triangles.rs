@@ -21,28 +21,28 @@ use std::ops::Range;
 
 /// Index lists, one after the other in the order of the sides.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Lists {
+pub(crate) struct Lists {
     /// Slots of a block, three a triangle. 16 bits are enough: n = 128 has 33,025 slots.
-    pub(super) indices: Vec<u16>,
+    pub(crate) indices: Vec<u16>,
     /// Where each side's list lies in `indices`.
-    pub(super) sides: [Range<u32>; 4],
+    pub(crate) sides: [Range<u32>; 4],
 }
 
 /// The form of a local grid: what all diamonds of this many segments, with centres or without, share.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(super) struct Form {
-    pub(super) segments: usize,
-    pub(super) centres: bool,
+pub(crate) struct Form {
+    pub(crate) segments: usize,
+    pub(crate) centres: bool,
 }
 
 impl Form {
-    pub(super) fn of(block: &Block) -> Self {
+    pub(crate) fn of(block: &Block) -> Self {
         Self { segments: block.segments(), centres: block.has_centres() }
     }
 }
 
 /// The lists of a diamond, of those triangles whose three slots `keep` wants.
-pub(super) fn lists(form: Form, keep: impl Fn(usize) -> bool) -> Lists {
+pub(crate) fn lists(form: Form, keep: impl Fn(usize) -> bool) -> Lists {
     let n = form.segments;
     let mut parts: [Vec<u16>; 4] = std::array::from_fn(|_| Vec::new());
     for v in 0..n {
@@ -82,7 +82,7 @@ pub(super) fn lists(form: Form, keep: impl Fn(usize) -> bool) -> Lists {
 }
 
 /// The lists of a diamond with nodata: triangles with a point that has no height are dropped.
-pub(super) fn lists_of(block: &Block) -> Lists {
+pub(crate) fn lists_of(block: &Block) -> Lists {
     lists(Form::of(block), |slot| block.heights()[slot] != NODATA)
 }
 
@@ -100,7 +100,7 @@ fn side_of(n: usize, u: usize, v: usize, [east, north]: [usize; 2]) -> usize {
 }
 
 /// Doubled local coordinates (2u, 2v) of each slot of a block.
-pub(super) fn places(form: Form) -> Vec<[u16; 2]> {
+pub(crate) fn places(form: Form) -> Vec<[u16; 2]> {
     let n = form.segments;
     let step = if form.centres { 1 } else { 2 };
     let mut places = vec![[0; 2]; (n + 1) * (n + 1) + if form.centres { n * n } else { 0 }];

@@ -1,0 +1,409 @@
+//! The viewer: terrain, a mouse and keys that move the eye, and a panel. What it runs in is another module's matter.
+//!
+//! | module | what it holds |
+//! |---|---|
+//! | `panel` | sliders, choices, figures, and what was clicked |
+//! | [`window`] | a native window: events in, pictures out |
+//!
+//! ```text
+//! events ──► ui: panel, keys, mouse ──► controls ──► camera ──► terrain's frame ──► what to draw
+//! ```
+//!
+//! All input comes through egui, so the same code serves a window and whatever else egui runs in, and a test can press
+//! keys and drag without any window.
+
+mod panel;
+pub mod window;
+
+use crate::camera::Camera;
+use crate::controls::{self, Controls, Thrust};
+use crate::drawing::DrawItem;
+use crate::headless;
+use crate::pick::{Hit, Picker, Ray};
+use crate::render::{FrameStats, Look};
+use crate::terrain::{FrameView, Terrain};
+use egui::{Event, Key, Modifiers, PointerButton, Sense, Ui};
+use glam::{DVec2, DVec3};
+use panel::History;
+use std::path::PathBuf;
+
+/// Radians that the view turns for a point (of 1/96 inch, about) of a drag.
+const TURN_PER_POINT: f64 = 0.005;
+
+/// Radians that arrow keys turn in a second.
+const TURN_PER_SECOND: f64 = 0.8;
+
+/// Part of the distance that a wheel's notch goes, of about 50 points.
+const ZOOM_PER_POINT: f64 = 0.004;
+
+/// The eye's least height above the ground, in cells of the finest layer, ...
+const CLEARANCE_CELLS: f64 = 0.5;
+
+/// ... and the least distance to what it zooms to.
+const NEAREST_CELLS: f64 = 3.0;
+
+/// A place that was clicked.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Mark {
+    /// In the frame's metres, its height as it is.
+    pub place: DVec3,
+    /// How far its height may be off the finest surface's, in metres, if that is known.
+    pub error: Option<f64>,
+    /// The layer.
+    pub layer: usize,
+}
+
+/// What whoever shows the viewer is asked to do.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Ask {
+    /// To save a picture of the terrain, without the panel.
+    Screenshot(PathBuf),
+    /// To put a text on the clipboard.
+    Copy(String),
+    /// To end.
+    Quit,
+}
+
+/// The viewer of a scene.
+pub struct Viewer {
+    terrain: Terrain,
+    /// The scene's address.
+    url: String,
+    controls: Controls,
+    home: Camera,
+    picker: Picker,
+    look: Look,
+    /// Which layers are drawn.
+    visible: Vec<bool>,
+    frame: FrameView,
+    /// What is drawn while the cut stands still.
+    frozen: Option<Vec<DrawItem>>,
+    /// What is being dragged.
+    grabbed: Option<DVec3>,
+    /// The last two places that were clicked.
+    marks: Vec<Mark>,
+    panel_is_open: bool,
+    history: History,
+    drawn: FrameStats,
+    message: Option<String>,
+    asks: Vec<Ask>,
+}
+
+impl Viewer {
+    /// A viewer of the scene at `url` that begins at `camera` (heights as they are), or with an overview.
+    #[must_use]
+    pub fn new(mut terrain: Terrain, url: &str, look: Look, size: [u32; 2], camera: Option<Camera>) -> Self {
+        terrain.set_exaggeration(look.exaggeration);
+        let home = headless::stretched_overview(terrain.scene(), size, look.exaggeration);
+        let stretch = |p: DVec3| p.with_z(p.z * look.exaggeration);
+        let stretched = |c: Camera| Camera { eye: stretch(c.eye), target: stretch(c.target), size, ..c };
+        let visible = vec![true; terrain.scene().layers.len()];
+        Self {
+            controls: Controls::new(stretched(camera.unwrap_or(home))),
+            home: stretched(home),
+            terrain,
+            url: url.to_owned(),
+            picker: Picker::default(),
+            look,
+            visible,
+            frame: FrameView::default(),
+            frozen: None,
+            grabbed: None,
+            marks: Vec::new(),
+            panel_is_open: true,
+            history: History::default(),
+            drawn: FrameStats::default(),
+            message: None,
+            asks: Vec::new(),
+        }
+    }
+
+    /// The camera now; its heights are stretched as the look says.
+    #[must_use]
+    pub fn camera(&self) -> &Camera {
+        self.controls.camera()
+    }
+
+    /// How frames look now.
+    #[must_use]
+    pub fn look(&self) -> &Look {
+        &self.look
+    }
+
+    /// The terrain.
+    #[must_use]
+    pub fn terrain(&self) -> &Terrain {
+        &self.terrain
+    }
+
+    /// What the last frame shows.
+    #[must_use]
+    pub fn frame(&self) -> &FrameView {
+        &self.frame
+    }
+
+    /// What was clicked, the last two.
+    #[must_use]
+    pub fn marks(&self) -> &[Mark] {
+        &self.marks
+    }
+
+    /// What to draw: of the layers that are visible, the cut of this frame, or the frozen one.
+    #[must_use]
+    pub fn items(&self) -> Vec<DrawItem> {
+        let items = self.frozen.as_ref().unwrap_or(&self.frame.items);
+        items.iter().filter(|item| self.visible.get(item.layer) == Some(&true)).cloned().collect()
+    }
+
+    /// What is asked for since the last call.
+    pub fn take_asks(&mut self) -> Vec<Ask> {
+        std::mem::take(&mut self.asks)
+    }
+
+    /// Says what became of something.
+    pub fn tell(&mut self, message: impl Into<String>) {
+        self.message = Some(message.into());
+    }
+
+    /// Takes in what a frame cost.
+    pub fn note(&mut self, drawn: FrameStats) {
+        self.drawn = drawn;
+    }
+
+    /// The picture's size in pixels.
+    pub fn resize(&mut self, size: [u32; 2]) {
+        self.controls.resize(size);
+        self.home.size = self.camera().size;
+    }
+
+    /// The scene's address with the view: `URL#x,y,z,heading,pitch`, metres and degrees.
+    #[must_use]
+    pub fn address(&self) -> String {
+        let eye = self.camera().eye;
+        let z = eye.z / self.look.exaggeration;
+        let [heading, pitch] = [self.controls.heading(), self.controls.pitch()].map(f64::to_degrees);
+        let heading = heading.rem_euclid(360.0);
+        format!("{}#{:.2},{:.2},{z:.2},{heading:.3},{pitch:.3}", self.url, eye.x, eye.y)
+    }
+
+    /// One frame: the panel, what keys and mouse do, and what the terrain shows then. Never waits.
+    pub fn update(&mut self, ui: &mut Ui) {
+        let seconds = f64::from(ui.input(|input| input.stable_dt)).min(0.1);
+        panel::show(self, ui);
+        self.steer(ui, seconds);
+        self.controls.step(seconds);
+        let eye = self.camera().eye;
+        let ground = self.picker.ground(
+            &self.terrain.scene().layers,
+            &self.frame.items,
+            self.look.exaggeration,
+            eye.truncate(),
+        );
+        if let Some(ground) = ground {
+            self.controls.stay_above(ground, CLEARANCE_CELLS * self.cell());
+        }
+        self.frame = self.terrain.frame(self.controls.camera());
+        self.history.note(seconds, &self.frame);
+        if !self.frame.complete || self.frame.moving > 0 || self.controls.is_gliding() {
+            ui.ctx().request_repaint();
+        }
+    }
+
+    /// Metres of the finest layer's cells.
+    fn cell(&self) -> f64 {
+        let cells = self.terrain.scene().layers.iter().flat_map(|layer| layer.cell);
+        cells.map(f64::abs).fold(f64::INFINITY, f64::min).min(1e6)
+    }
+
+    /// What is under a place of the picture, in pixels.
+    fn pick(&mut self, at: DVec2) -> Option<Hit> {
+        let camera = self.controls.camera();
+        let ray = Ray { origin: camera.eye, direction: controls::ray(camera, at) };
+        let items = self.items();
+        self.picker.pick(&self.terrain.scene().layers, &items, self.look.exaggeration, &ray)
+    }
+
+    /// What to move around a place of the picture: the ground there, or a point as far away as the target.
+    fn pivot(&mut self, at: DVec2) -> DVec3 {
+        let hit = self.pick(at);
+        let camera = self.controls.camera();
+        let distance = (camera.target - camera.eye).length();
+        hit.map_or_else(|| camera.eye + controls::ray(camera, at) * distance, |hit| hit.point)
+    }
+
+    fn steer(&mut self, ui: &mut Ui, seconds: f64) {
+        let scale = f64::from(ui.ctx().pixels_per_point());
+        let rect = ui.available_rect_before_wrap();
+        let response = ui.interact(rect, ui.scope_id().with("terrain"), Sense::click_and_drag());
+        let pixel = |p: egui::Pos2| DVec2::new(f64::from(p.x), f64::from(p.y)) * scale;
+        let nearest = NEAREST_CELLS * self.cell();
+        let modifiers = ui.input(|input| input.modifiers);
+        let pointer = response.interact_pointer_pos();
+        if response.drag_started()
+            && let Some(origin) = ui.input(|input| input.pointer.press_origin())
+        {
+            self.grabbed = Some(self.pivot(pixel(origin)));
+        }
+        if let (Some(grabbed), Some(at)) = (self.grabbed, pointer) {
+            let turns = response.dragged_by(PointerButton::Middle)
+                || response.dragged_by(PointerButton::Secondary)
+                || response.dragged_by(PointerButton::Primary) && modifiers.command_only();
+            if turns {
+                let by = response.drag_delta();
+                let [right, up] = [-by.x, -by.y].map(|points| f64::from(points) * TURN_PER_POINT);
+                self.controls.turn(grabbed, right, up);
+            } else if response.dragged_by(PointerButton::Primary) {
+                self.controls.pan(grabbed, pixel(at));
+            }
+        }
+        if response.drag_stopped() {
+            self.grabbed = None;
+        }
+        if let Some(at) = response.hover_pos() {
+            let (scroll, pinch) = ui.input(|input| (input.smooth_scroll_delta().y, input.zoom_delta()));
+            let factor = (-f64::from(scroll) * ZOOM_PER_POINT).exp() / f64::from(pinch);
+            if factor != 1.0 {
+                let point = self.pivot(pixel(at));
+                self.controls.zoom(point, factor, nearest);
+            }
+        }
+        if response.double_clicked()
+            && let Some(hit) = pointer.and_then(|at| self.pick(pixel(at)))
+        {
+            self.controls.glide_near(hit.point, nearest);
+        } else if response.clicked()
+            && let Some(hit) = pointer.and_then(|at| self.pick(pixel(at)))
+        {
+            self.mark(&hit);
+        }
+        if !ui.ctx().egui_wants_keyboard_input() {
+            self.keys(ui, seconds);
+        }
+    }
+
+    fn mark(&mut self, hit: &Hit) {
+        let error = self.terrain.error_metres(hit.layer, hit.diamond, hit.side);
+        let place = hit.point.with_z(hit.point.z / self.look.exaggeration);
+        self.marks.push(Mark { place, error, layer: hit.layer });
+        if self.marks.len() > 2 {
+            self.marks.remove(0);
+        }
+    }
+
+    fn keys(&mut self, ui: &Ui, seconds: f64) {
+        let (held, fast) = ui.input(|input| {
+            let held = |key: Key| f64::from(u8::from(input.key_down(key) && !input.modifiers.command));
+            let axis = |more: Key, less: Key| held(more) - held(less);
+            (
+                [
+                    axis(Key::D, Key::A),
+                    axis(Key::W, Key::S),
+                    axis(Key::E, Key::Q),
+                    axis(Key::ArrowRight, Key::ArrowLeft),
+                    axis(Key::ArrowUp, Key::ArrowDown),
+                ],
+                input.modifiers.shift,
+            )
+        });
+        let [right, ahead, up, turn, tilt] = held;
+        if held != [0.0; 5] {
+            let camera = self.camera();
+            let (eye, cell) = (camera.eye, self.cell());
+            let layers = &self.terrain.scene().layers;
+            let ground =
+                self.picker.ground(layers, &self.frame.items, self.look.exaggeration, eye.truncate());
+            let height = (eye.z - ground.unwrap_or(self.camera().target.z)).abs().max(5.0 * cell);
+            self.controls.fly(&Thrust { right, ahead, up, fast }, height, seconds);
+            if [turn, tilt] != [0.0; 2] {
+                let by = TURN_PER_SECOND * seconds;
+                self.controls.turn(self.controls.camera().eye, turn * by, tilt * by);
+            }
+            ui.ctx().request_repaint();
+        }
+        let pressed = |key: Key| {
+            let is_it = |event: &Event| {
+                matches!(event, Event::Key { key: found, pressed: true, repeat: false, modifiers, .. }
+                    if *found == key && matches!(*modifiers, Modifiers::NONE | Modifiers::SHIFT))
+            };
+            ui.input(|input| input.events.iter().any(is_it))
+        };
+        if pressed(Key::H) {
+            self.go_home();
+        }
+        if pressed(Key::N) {
+            self.north_up();
+        }
+        if pressed(Key::F) {
+            self.frame_scene();
+        }
+        if pressed(Key::P) {
+            self.ask_screenshot();
+        }
+        if pressed(Key::Tab) {
+            self.panel_is_open = !self.panel_is_open;
+        }
+        if pressed(Key::Escape) {
+            self.marks.clear();
+            self.message = None;
+        }
+        if ui.input(|input| input.events.iter().any(|event| matches!(event, Event::Copy))) {
+            self.asks.push(Ask::Copy(self.address()));
+        }
+    }
+
+    /// Flies to where the viewer began.
+    fn go_home(&mut self) {
+        self.controls.glide_to(self.home);
+    }
+
+    /// Turns until north is up, around the middle of the picture.
+    fn north_up(&mut self) {
+        let middle = DVec2::from(self.camera().size.map(|s| f64::from(s) / 2.0));
+        let pivot = self.pivot(middle);
+        self.controls.glide_north(pivot);
+    }
+
+    /// Flies to where the whole scene is seen.
+    fn frame_scene(&mut self) {
+        let camera = self.camera();
+        let whole = headless::stretched_overview(self.terrain.scene(), camera.size, self.look.exaggeration);
+        let stretch = |p: DVec3| p.with_z(p.z * self.look.exaggeration);
+        self.controls.glide_to(Camera { eye: stretch(whole.eye), target: stretch(whole.target), ..whole });
+    }
+
+    fn ask_screenshot(&mut self) {
+        let mut number = 1;
+        let name = |number: u32| PathBuf::from(format!("{}-{number:03}.png", self.terrain.scene().name));
+        while name(number).exists() {
+            number += 1;
+        }
+        let path = name(number);
+        self.asks.push(Ask::Screenshot(path));
+    }
+
+    fn set_exaggeration(&mut self, exaggeration: f64) {
+        let by = exaggeration / self.look.exaggeration;
+        self.look.exaggeration = exaggeration;
+        self.terrain.set_exaggeration(exaggeration);
+        self.controls.stretch(by);
+        for p in [&mut self.home.eye, &mut self.home.target] {
+            p.z *= by;
+        }
+        self.frozen = None;
+    }
+}
+
+/// The camera of what follows the `#` of an address: see [`Viewer::address`]. `None` if it is none.
+#[must_use]
+pub fn camera_at(view: &str, size: [u32; 2]) -> Option<Camera> {
+    let numbers: Vec<f64> = view.trim().split(',').map(|n| n.trim().parse().ok()).collect::<Option<_>>()?;
+    let [x, y, z, heading, pitch] = numbers.try_into().ok()?;
+    let is_view = [x, y, z, heading].iter().all(|n: &f64| n.is_finite()) && (-90.0..=90.0).contains(&pitch);
+    let (heading, pitch) = (heading.to_radians(), pitch.to_radians());
+    let ahead = DVec3::new(heading.sin() * pitch.cos(), heading.cos() * pitch.cos(), -pitch.sin());
+    let eye = DVec3::new(x, y, z);
+    is_view.then(|| Camera { eye, target: eye + ahead * z.abs().max(1.0), fov_y: crate::camera::FOV_Y, size })
+}
+
+#[cfg(test)]
+mod tests;

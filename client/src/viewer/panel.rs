@@ -1,0 +1,302 @@
+//! The panel: what can be chosen, figures, and what was clicked.
+
+use super::{Ask, Mark, Viewer};
+use crate::render::{Background, Colours};
+use crate::terrain::FrameView;
+use egui::{Color32, ComboBox, Frame, Panel, RichText, ScrollArea, Slider, Stroke, Ui};
+use std::collections::VecDeque;
+
+/// Frames that the plots show.
+const HISTORY: usize = 240;
+
+/// What has been seen frame by frame.
+#[derive(Debug, Default)]
+pub(super) struct History {
+    milliseconds: VecDeque<f32>,
+    errors: VecDeque<f32>,
+    kilobytes: VecDeque<f32>,
+    bytes: u64,
+}
+
+impl History {
+    pub(super) fn note(&mut self, seconds: f64, frame: &FrameView) {
+        let bytes = frame.stats.traffic.bytes;
+        #[allow(clippy::cast_possible_truncation, reason = "for a plot")]
+        let values = [seconds * 1e3, frame.error_pixels, bytes.saturating_sub(self.bytes) as f64 / 1e3]
+            .map(|v| v as f32);
+        self.bytes = bytes;
+        for (list, value) in
+            [&mut self.milliseconds, &mut self.errors, &mut self.kilobytes].into_iter().zip(values)
+        {
+            list.push_back(value);
+            if list.len() > HISTORY {
+                list.pop_front();
+            }
+        }
+    }
+
+    /// Frames a second, over the last half second or so.
+    fn rate(&self) -> f32 {
+        let last: Vec<f32> = self.milliseconds.iter().rev().take(30).copied().collect();
+        1e3 * last.len() as f32 / last.iter().sum::<f32>().max(1e-3)
+    }
+}
+
+/// Draws the panel, the bar of progress, and the scale of what was clicked.
+pub(super) fn show(viewer: &mut Viewer, ui: &mut Ui) {
+    progress(viewer, ui);
+    if !viewer.panel_is_open {
+        return;
+    }
+    let fill = ui.visuals().panel_fill.gamma_multiply(0.94);
+    let frame = Frame::new().fill(fill).inner_margin(10);
+    Panel::right("panel").frame(frame).resizable(true).default_size(270.0).show(ui, |ui| {
+        ScrollArea::vertical().show(ui, |ui| {
+            scene(viewer, ui);
+            view(viewer, ui);
+            light(viewer, ui);
+            marks(viewer, ui);
+            figures(viewer, ui);
+            keys(ui);
+        });
+    });
+}
+
+fn heading(ui: &mut Ui, text: &str) {
+    ui.add_space(8.0);
+    ui.label(RichText::new(text).strong());
+}
+
+fn scene(viewer: &mut Viewer, ui: &mut Ui) {
+    let scene = viewer.terrain.scene();
+    ui.heading(&scene.name);
+    ui.label(RichText::new(format!("version {}", scene.version)).weak().small());
+    let names: Vec<String> = scene.layers.iter().map(|layer| layer.name.clone()).collect();
+    for (name, visible) in names.iter().zip(&mut viewer.visible) {
+        ui.checkbox(visible, name);
+    }
+    ui.horizontal(|ui| {
+        if ui.button("Home").on_hover_text("H").clicked() {
+            viewer.go_home();
+        }
+        if ui.button("North up").on_hover_text("N").clicked() {
+            viewer.north_up();
+        }
+        if ui.button("Whole scene").on_hover_text("F").clicked() {
+            viewer.frame_scene();
+        }
+    });
+    ui.horizontal(|ui| {
+        if ui.button("Save picture").on_hover_text("P").clicked() {
+            viewer.ask_screenshot();
+        }
+        if ui.button("Copy view").on_hover_text("Ctrl+C: its address, to be opened again").clicked() {
+            viewer.asks.push(Ask::Copy(viewer.address()));
+        }
+    });
+}
+
+fn view(viewer: &mut Viewer, ui: &mut Ui) {
+    heading(ui, "View");
+    let mut pixels = viewer.terrain.tolerance_pixels();
+    if ui.add(Slider::new(&mut pixels, 0.25..=32.0).logarithmic(true).text("error [px]")).changed() {
+        viewer.terrain.set_tolerance_pixels(pixels);
+    }
+    let mut exaggeration = viewer.look.exaggeration;
+    if ui.add(Slider::new(&mut exaggeration, 0.1..=20.0).logarithmic(true).text("exaggeration")).changed() {
+        viewer.set_exaggeration(exaggeration);
+    }
+    let name = |colours: Colours| match colours {
+        Colours::Auto => "as the heights suggest",
+        Colours::Terrain => "terrain",
+        Colours::Bathymetry => "terrain and sea",
+        Colours::Grey => "grey by height",
+        Colours::Flat => "one grey",
+    };
+    ComboBox::from_label("colours").selected_text(name(viewer.look.colours)).show_ui(ui, |ui| {
+        for colours in [Colours::Auto, Colours::Terrain, Colours::Bathymetry, Colours::Grey, Colours::Flat] {
+            ui.selectable_value(&mut viewer.look.colours, colours, name(colours));
+        }
+    });
+    ui.checkbox(&mut viewer.look.wireframe, "wireframe");
+    ui.checkbox(&mut viewer.look.show_levels, "levels as colours");
+    let mut is_frozen = viewer.frozen.is_some();
+    if ui.checkbox(&mut is_frozen, "freeze what is drawn").changed() {
+        viewer.frozen = is_frozen.then(|| viewer.frame.items.clone());
+    }
+}
+
+fn light(viewer: &mut Viewer, ui: &mut Ui) {
+    heading(ui, "Light");
+    let sun = &mut viewer.look.sun;
+    ui.add(Slider::new(&mut sun.azimuth_degrees, 0.0..=360.0).text("sun from [°]"));
+    ui.add(Slider::new(&mut sun.altitude_degrees, 0.0..=90.0).text("sun above [°]"));
+    ui.add(Slider::new(&mut viewer.look.haze, 0.0..=4.0).text("haze"));
+    let mut has_sky = viewer.look.background == Background::Sky;
+    if ui.checkbox(&mut has_sky, "sky").changed() {
+        viewer.look.background =
+            if has_sky { Background::Sky } else { Background::Colour([0.003, 0.003, 0.004, 1.0]) };
+    }
+}
+
+fn marks(viewer: &Viewer, ui: &mut Ui) {
+    heading(ui, "Clicked");
+    let row = |ui: &mut Ui, mark: &Mark| {
+        let error = mark.error.map_or(String::new(), |error| format!(" ± {error:.1}"));
+        ui.monospace(format!("{:.1}, {:.1}", mark.place.x, mark.place.y));
+        let layer = &viewer.terrain.scene().layers[mark.layer].name;
+        ui.monospace(format!("height {:.1}{error} m, {layer}", mark.place.z));
+    };
+    match viewer.marks() {
+        [] => {
+            ui.label(RichText::new("Click the ground for its height.").weak());
+        }
+        [one] => row(ui, one),
+        [first, last, ..] => {
+            row(ui, first);
+            row(ui, last);
+            let by = last.place - first.place;
+            ui.monospace(format!("{:.1} m apart on the level, {:+.1} m up", by.truncate().length(), by.z));
+        }
+    }
+}
+
+fn figures(viewer: &Viewer, ui: &mut Ui) {
+    heading(ui, "Figures");
+    let frame = &viewer.frame;
+    let stats = &frame.stats;
+    let mut row = |name: &str, value: String| {
+        ui.horizontal(|ui| {
+            ui.label(RichText::new(name).weak());
+            ui.with_layout(egui::Layout::right_to_left(egui::Align::Center), |ui| ui.monospace(value));
+        });
+    };
+    row("frames a second", format!("{:.0}", viewer.history.rate()));
+    row("largest error", format!("{:.2} px", frame.error_pixels));
+    row("triangles", grouped(viewer.drawn.triangles));
+    row("diamonds drawn", grouped(frame.items.len() as u64));
+    row("diamonds resident", grouped(stats.resident as u64));
+    row("received", format!("{:.2} MB", stats.traffic.bytes as f64 / 1e6));
+    row("requests", format!("{} in {} round trips", stats.traffic.requests, stats.traffic.round_trips));
+    row("memory", format!("{:.0} MB", stats.resident_bytes as f64 / 1e6));
+    row("graphics memory", format!("{:.0} MB", viewer.drawn.gpu_bytes as f64 / 1e6));
+    let history = &viewer.history;
+    plot(ui, "ms a frame", &history.milliseconds);
+    plot(ui, "error [px]", &history.errors);
+    plot(ui, "kB a frame", &history.kilobytes);
+    if let Some(problem) = viewer.terrain.problem() {
+        ui.colored_label(Color32::from_rgb(220, 120, 60), problem);
+    }
+    if viewer.terrain.scene_changed() {
+        ui.colored_label(Color32::from_rgb(220, 120, 60), "The server has another version: open it again.");
+    }
+}
+
+/// A number with a space at each three digits.
+fn grouped(number: u64) -> String {
+    let digits = number.to_string();
+    let mut text = String::new();
+    for (i, digit) in digits.chars().enumerate() {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
+            text.push(' ');
+        }
+        text.push(digit);
+    }
+    text
+}
+
+/// Values over time, the newest at the right.
+fn plot(ui: &mut Ui, name: &str, values: &VecDeque<f32>) {
+    let size = egui::vec2(ui.available_width(), 34.0);
+    let (rect, _) = ui.allocate_exact_size(size, egui::Sense::hover());
+    let painter = ui.painter_at(rect);
+    painter.rect_filled(rect, 3.0, ui.visuals().extreme_bg_color);
+    let known = || values.iter().copied().filter(|v| v.is_finite());
+    let most = known().fold(0.0f32, f32::max);
+    let points: Vec<egui::Pos2> = values
+        .iter()
+        .enumerate()
+        .filter(|(_, v)| v.is_finite())
+        .map(|(i, v)| {
+            let x = rect.right() - (values.len() - 1 - i) as f32 / HISTORY as f32 * rect.width();
+            egui::pos2(x, rect.bottom() - 2.0 - v / most.max(1e-6) * (rect.height() - 6.0))
+        })
+        .collect();
+    painter.line(points, Stroke::new(1.2, ui.visuals().hyperlink_color));
+    let text = format!("{name}, up to {most:.1}");
+    let font = egui::FontId::proportional(10.0);
+    painter.text(
+        rect.left_top() + egui::vec2(4.0, 2.0),
+        egui::Align2::LEFT_TOP,
+        text,
+        font,
+        ui.visuals().weak_text_color(),
+    );
+}
+
+fn keys(ui: &mut Ui) {
+    heading(ui, "Keys and mouse");
+    for (what, does) in [
+        ("drag", "moves the ground"),
+        ("Ctrl, right or middle drag", "turns around it"),
+        ("wheel", "goes to the cursor"),
+        ("double click", "flies there"),
+        ("W A S D, Q E", "fly (Shift: faster)"),
+        ("arrows", "look around"),
+        ("H, N, F", "home, north, whole scene"),
+        ("P, Tab, Esc", "picture, panel, clear"),
+    ] {
+        ui.horizontal_wrapped(|ui| {
+            ui.label(RichText::new(what).small().strong());
+            ui.label(RichText::new(does).small().weak());
+        });
+    }
+}
+
+/// A thin line at the bottom while data arrives, and what there is to say.
+fn progress(viewer: &Viewer, ui: &mut Ui) {
+    let frame = &viewer.frame;
+    let rect = ui.max_rect();
+    let painter = ui.painter();
+    let mut text = viewer.message.clone();
+    if !frame.complete {
+        let goal = frame.error_pixels_goal.max(viewer.terrain.tolerance_pixels());
+        // By the order of size of what is still wrong.
+        let part = if frame.error_pixels.is_finite() {
+            1.0 / (1.0 + (frame.error_pixels / goal).max(1.0).log2())
+        } else {
+            0.02
+        };
+        #[allow(clippy::cast_possible_truncation, reason = "a part of a line")]
+        let width = rect.width() * part as f32;
+        let line = egui::Rect::from_min_max(
+            rect.left_bottom() - egui::vec2(0.0, 3.0),
+            egui::pos2(rect.left() + width, rect.bottom()),
+        );
+        painter.rect_filled(line, 0.0, Color32::from_rgb(80, 150, 230));
+        let error = if frame.error_pixels.is_finite() {
+            format!("error {:.1} px", frame.error_pixels)
+        } else {
+            "waiting for the first data".to_owned()
+        };
+        text = Some(text.map_or(error.clone(), |text| format!("{text}    {error}")));
+    }
+    if let Some(text) = text {
+        let at = rect.left_bottom() + egui::vec2(10.0, -10.0);
+        let font = egui::FontId::proportional(13.0);
+        for (by, colour) in [(1.0, Color32::from_black_alpha(180)), (0.0, Color32::WHITE)] {
+            let at = at + egui::vec2(by, by);
+            painter.text(at, egui::Align2::LEFT_BOTTOM, &text, font.clone(), colour);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn numbers_are_grouped_by_three_digits() {
+        for (number, text) in [(0, "0"), (999, "999"), (1000, "1 000"), (1_234_567, "1 234 567")] {
+            assert_eq!(super::grouped(number), text);
+        }
+    }
+}

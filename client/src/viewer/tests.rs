@@ -1,0 +1,261 @@
+//! Keys and a mouse without a window, over a scene from a made server.
+
+use super::*;
+use crate::fetch;
+use crate::terrain::Options;
+use crate::world::{Faults, Served, above, world};
+use egui::{Pos2, RawInput, Rect, pos2, vec2};
+use std::time::{Duration, Instant};
+
+const SIZE: [u32; 2] = [1000, 700];
+
+/// A viewer with its own clock, and what is put into it.
+struct Hand {
+    viewer: Viewer,
+    context: egui::Context,
+    seconds: f64,
+    _served: Served,
+}
+
+impl Hand {
+    fn new(camera: Option<Camera>) -> Self {
+        let served = Served::start(1, Faults::default());
+        let terrain =
+            Terrain::open(&served.url, Options { fetch: fetch::Options::default(), ..Options::default() });
+        let viewer = Viewer::new(terrain.unwrap(), &served.url, Look::default(), SIZE, camera);
+        let mut hand = Self { viewer, context: egui::Context::default(), seconds: 0.0, _served: served };
+        hand.settle();
+        hand
+    }
+
+    /// A frame of a sixtieth of a second with these events.
+    fn frame(&mut self, events: &[Event]) {
+        self.frame_with(Modifiers::NONE, events);
+    }
+
+    fn frame_with(&mut self, modifiers: Modifiers, events: &[Event]) {
+        self.seconds += 1.0 / 60.0;
+        let size = SIZE.map(|s| s as f32);
+        let input = RawInput {
+            screen_rect: Some(Rect::from_min_size(Pos2::ZERO, vec2(size[0], size[1]))),
+            time: Some(self.seconds),
+            predicted_dt: 1.0 / 60.0,
+            events: [&[Event::ModifiersChanged(modifiers)], events].concat(),
+            focused: true,
+            ..RawInput::default()
+        };
+        let viewer = &mut self.viewer;
+        self.context.run_ui(input, |ui| viewer.update(ui)).drop_without_applying_deltas();
+    }
+
+    /// Frames until nothing is missing and nothing moves.
+    fn settle(&mut self) {
+        let until = Instant::now() + Duration::from_secs(60);
+        loop {
+            self.frame(&[]);
+            let frame = self.viewer.frame();
+            if frame.complete && frame.moving == 0 && !self.viewer.controls.is_gliding() {
+                return;
+            }
+            assert!(Instant::now() < until, "{:?}", self.viewer.frame().stats);
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+
+    fn button(&mut self, at: Pos2, button: PointerButton, pressed: bool, modifiers: Modifiers) {
+        self.frame_with(modifiers, &[Event::PointerButton { pos: at, button, pressed, modifiers }]);
+    }
+
+    fn drag(&mut self, from: Pos2, to: Pos2, button: PointerButton, modifiers: Modifiers) {
+        self.frame_with(modifiers, &[Event::PointerMoved(from)]);
+        self.button(from, button, true, modifiers);
+        for i in 1..=8 {
+            self.frame_with(modifiers, &[Event::PointerMoved(from.lerp(to, i as f32 / 8.0))]);
+        }
+        self.button(to, button, false, modifiers);
+    }
+
+    fn click(&mut self, at: Pos2) {
+        self.frame(&[Event::PointerMoved(at)]);
+        self.button(at, PointerButton::Primary, true, Modifiers::NONE);
+        self.button(at, PointerButton::Primary, false, Modifiers::NONE);
+    }
+
+    fn key(&mut self, key: Key, pressed: bool) {
+        let modifiers = Modifiers::NONE;
+        self.frame(&[Event::Key { key, physical_key: None, pressed, repeat: false, modifiers }]);
+    }
+
+    fn camera(&self) -> Camera {
+        *self.viewer.camera()
+    }
+
+    /// Two places of the picture, apart from each other, where there is ground all around.
+    fn solid(&mut self) -> [Pos2; 2] {
+        let places = (4..14).flat_map(|y| (4..16).map(move |x| pos2(40.0 * x as f32, 40.0 * y as f32)));
+        let near = [vec2(0.0, 0.0), vec2(30.0, 0.0), vec2(-30.0, 0.0), vec2(0.0, 30.0), vec2(0.0, -30.0)];
+        let pixel = |p: Pos2| DVec2::new(p.x.into(), p.y.into());
+        let solid: Vec<Pos2> =
+            places.filter(|p| near.iter().all(|by| self.viewer.pick(pixel(*p + *by)).is_some())).collect();
+        assert!(solid.len() > 20, "little to be seen: {}", solid.len());
+        [solid[solid.len() / 3], solid[solid.len() * 2 / 3]]
+    }
+
+    fn seen_at(&mut self, at: Pos2) -> DVec3 {
+        self.viewer.pick(DVec2::new(at.x.into(), at.y.into())).unwrap().point
+    }
+}
+
+fn looking_down() -> Camera {
+    Camera { size: SIZE, ..above() }
+}
+
+#[test]
+fn what_is_grabbed_goes_with_the_mouse() {
+    let mut hand = Hand::new(Some(looking_down()));
+    let [from, to] = hand.solid();
+    let (grabbed, before) = (hand.seen_at(from), hand.camera());
+    hand.drag(from, to, PointerButton::Primary, Modifiers::NONE);
+    let moved = hand.camera().eye - before.eye;
+    assert!(moved.truncate().length() > 1.0 && moved.z == 0.0, "{moved}");
+    let clip = hand.camera().clip_from_eye(0.1).project_point3((grabbed - hand.camera().eye).as_vec3());
+    let at = [500.0 + 500.0 * clip.x, 350.0 - 350.0 * clip.y];
+    assert!((at[0] - to.x).hypot(at[1] - to.y) < 1.0, "{at:?}");
+}
+
+#[test]
+fn a_drag_with_control_or_the_middle_button_turns_around_what_is_grabbed() {
+    for (button, modifiers) in [
+        (PointerButton::Primary, Modifiers::COMMAND),
+        (PointerButton::Middle, Modifiers::NONE),
+        (PointerButton::Secondary, Modifiers::NONE),
+    ] {
+        let mut hand = Hand::new(Some(looking_down()));
+        let [from, to] = hand.solid();
+        let (grabbed, before) = (hand.seen_at(from), hand.camera());
+        hand.drag(from, to + vec2(60.0, 40.0), button, modifiers);
+        let [old, new] = [before, hand.camera()].map(|camera| (camera.eye - grabbed).length());
+        assert!((old - new).abs() < 1e-6 * old, "{button:?}: the distance stays");
+        assert!((hand.camera().eye - before.eye).length() > 0.05 * old, "{button:?}: the eye moves");
+    }
+}
+
+#[test]
+fn the_wheel_goes_to_the_cursor() {
+    let mut hand = Hand::new(Some(looking_down()));
+    let [at, _] = hand.solid();
+    let (point, before) = (hand.seen_at(at), hand.camera());
+    let wheel = Event::MouseWheel {
+        unit: egui::MouseWheelUnit::Line,
+        delta: vec2(0.0, 3.0),
+        modifiers: Modifiers::NONE,
+        phase: egui::TouchPhase::Move,
+        source: egui::MouseWheelSource::Wheel,
+    };
+    hand.frame(&[Event::PointerMoved(at)]);
+    hand.frame(&[wheel]);
+    (0..60).for_each(|_| hand.frame(&[]));
+    let [old, new] = [before, hand.camera()].map(|camera| (camera.eye - point).length());
+    assert!(new < 0.9 * old, "{old} {new}");
+    let apart = (hand.seen_at(at) - point).length();
+    assert!(apart < 0.02 * new, "the point stays under the cursor: {apart} of {new}");
+}
+
+#[test]
+fn keys_fly_and_go_home() {
+    let mut hand = Hand::new(None);
+    let home = hand.camera();
+    hand.key(Key::W, true);
+    (0..30).for_each(|_| hand.frame(&[]));
+    hand.key(Key::W, false);
+    let flown = hand.camera().eye - home.eye;
+    assert!(flown.y > 0.0 && flown.x.abs() < 1e-6 * flown.y, "north: {flown}");
+    let stopped = hand.camera();
+    hand.frame(&[]);
+    assert_eq!(hand.camera(), stopped);
+    // Down into the ground: not below it.
+    hand.key(Key::Q, true);
+    (0..600).for_each(|_| hand.frame(&[]));
+    hand.key(Key::Q, false);
+    let (eye, look) = (hand.camera().eye, hand.viewer.look.exaggeration);
+    let items = hand.viewer.items();
+    let layers = &hand.viewer.terrain.scene().layers;
+    if let Some(ground) = hand.viewer.picker.ground(layers, &items, look, eye.truncate()) {
+        assert!(eye.z >= ground, "{eye} under {ground}");
+    }
+    hand.key(Key::H, true);
+    hand.settle();
+    assert!((hand.camera().eye - home.eye).length() < 1e-6, "home again");
+}
+
+#[test]
+fn a_click_tells_the_height_and_its_error() {
+    let mut hand = Hand::new(Some(looking_down()));
+    // The finest there is, so that the height is that of the source.
+    hand.viewer.terrain.set_tolerance_pixels(1e-6);
+    hand.settle();
+    let places = hand.solid();
+    hand.click(places[0]);
+    // Long enough apart not to be a double click.
+    (0..60).for_each(|_| hand.frame(&[]));
+    hand.click(places[1]);
+    let marks = hand.viewer.marks().to_vec();
+    assert_eq!(marks.len(), 2);
+    let layer = &world()[0].layer;
+    for mark in marks {
+        assert!(mark.error.unwrap() <= f64::from(layer.finest_error) + 1e-6, "{mark:?}");
+        assert!((layer.heights[0]..=layer.heights[1]).contains(&mark.place.z), "{mark:?}");
+        let items = hand.viewer.items();
+        let layers = &hand.viewer.terrain.scene().layers;
+        let ground = hand.viewer.picker.ground(layers, &items, 1.0, mark.place.truncate()).unwrap();
+        assert!((ground - mark.place.z).abs() < 1e-3, "{ground} {mark:?}");
+    }
+    hand.key(Key::Escape, true);
+    assert!(hand.viewer.marks().is_empty());
+}
+
+#[test]
+fn a_double_click_flies_there() {
+    let mut hand = Hand::new(Some(looking_down()));
+    let [at, _] = hand.solid();
+    let (point, before) = (hand.seen_at(at), hand.camera());
+    hand.click(at);
+    hand.click(at);
+    assert!(hand.viewer.controls.is_gliding());
+    hand.settle();
+    assert!((hand.camera().target - point).length() < 1e-6);
+    assert!((hand.camera().eye - point).length() < 0.5 * (before.eye - point).length());
+}
+
+#[test]
+fn an_address_opens_the_same_view_again() {
+    let mut hand = Hand::new(Some(looking_down()));
+    hand.drag(pos2(350.0, 350.0), pos2(450.0, 300.0), PointerButton::Middle, Modifiers::NONE);
+    hand.viewer.set_exaggeration(2.5);
+    let address = hand.viewer.address();
+    let (url, view) = address.split_once('#').unwrap();
+    assert_eq!(url, hand.viewer.url);
+    let camera = camera_at(view, SIZE).unwrap();
+    let mut again = Hand::new(Some(camera));
+    again.viewer.set_exaggeration(2.5);
+    let [a, b] = [&hand, &again].map(Hand::camera);
+    assert!((a.eye - b.eye).length() < 0.1, "{} {}", a.eye, b.eye);
+    for wrong in ["", "1,2,3", "1,2,3,4,x", "1,2,nan,0,0", "1,2,3,0,95", "1,2,3,4,5,6"] {
+        assert!(camera_at(wrong, SIZE).is_none(), "{wrong}");
+    }
+}
+
+#[test]
+fn a_frozen_cut_stays_while_the_eye_moves() {
+    let mut hand = Hand::new(Some(looking_down()));
+    let before: Vec<_> = hand.viewer.items().iter().map(|item| (item.diamond, item.sides)).collect();
+    hand.viewer.frozen = Some(hand.viewer.items());
+    hand.key(Key::F, true);
+    hand.settle();
+    let items = |viewer: &Viewer| viewer.items().iter().map(|i| (i.diamond, i.sides)).collect::<Vec<_>>();
+    assert_eq!(items(&hand.viewer), before);
+    hand.viewer.frozen = None;
+    assert_ne!(items(&hand.viewer), before);
+    hand.viewer.visible[0] = false;
+    assert!(hand.viewer.items().is_empty());
+}
