@@ -54,7 +54,8 @@ fn until_answered(url: &str, path: &str, words: &str) -> String {
     loop {
         let mut stream = connect(url);
         // Whoever has no place is cut off, at times before the request is written.
-        let found = try_request(&mut stream, path).map_or_else(|error| error.to_string(), |()| answer(&mut stream));
+        let found =
+            try_request(&mut stream, path).map_or_else(|error| error.to_string(), |()| answer(&mut stream));
         if found.contains(words) {
             return found;
         }

@@ -13,7 +13,7 @@
 //!
 //! Memory: a tile's samples and the meshes of one diamond a worker, [`WINDOW_SAMPLES`] at most, unless an error is to
 //! be kept at each collapse: then all samples of a diamond, of the largest ones one by one. Disk: the halves of two
-//! levels, some 20 bytes a sample in all.
+//! levels, some 30 bytes a sample in all.
 
 mod halves;
 mod tile;
