@@ -289,6 +289,18 @@ fn a_dry_run_writes_nothing_and_is_not_far_off() {
     for field in ["seconds", "memory_bytes", "disk_bytes"] {
         assert!(estimate[field].as_f64().unwrap() > 0.0, "{field}: {}", estimate[field]);
     }
+    assert_eq!((&estimate["triangles"], &estimate["tin_bytes"]), (&0.into(), &0.into()));
+    // Of triangles as well.
+    let dry = server(folder, "build {}/dem.tif -o {}/tin --encoding tin --dry-run --json");
+    let whole = server(folder, "build {}/dem.tif -o {}/tin --encoding tin --json");
+    let estimate: serde_json::Value = serde_json::from_str(&dry.out).unwrap();
+    let report: serde_json::Value = serde_json::from_str(&whole.out).unwrap();
+    let found = &report["scene"]["layers"][0]["tin"];
+    for (field, found) in [("triangles", &found["triangles"]), ("tin_bytes", &found["bytes"])] {
+        let ratio = estimate[field].as_f64().unwrap() / found.as_f64().unwrap();
+        assert!((0.8..1.2).contains(&ratio), "{field}: {} for {found}", estimate[field]);
+    }
+    assert_eq!((&estimate["diamonds"], &estimate["point_bytes"]), (&0.into(), &0.into()));
     // And the options that make no sense are refused as in a build.
     let wrong = server(folder, "build {}/dem.tif -o {}/store2 --dry-run --memory 1MiB");
     assert_failed(&wrong, 2, &["--memory"], "a dry run with too little memory");

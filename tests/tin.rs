@@ -5,7 +5,7 @@
 //! plane, by whole numbers. A sample that no triangle covers, though the source's own mesh has it, lies as near to one.
 
 use crate::determinism::files;
-use crate::hostile::{end, server, signal, start, words};
+use crate::hostile::{assert_failed, end, server, signal, start, words};
 use crate::truth::{Samples, dems};
 use crate::world::{build, data, options, programs, serve};
 use diamantina_protocol::NODATA;
@@ -259,6 +259,37 @@ fn every_sample_of_real_dems_is_within_the_declared_error_and_borders_fit() {
         }
     }
     assert_eq!(seen, chosen.len());
+}
+
+/// Minutes to an hour: as a reader asks for it, and for docs/BENCHMARKS.md.
+#[test]
+#[ignore = "takes as long as all other tests together: run it alone, with --ignored"]
+fn every_sample_of_every_real_dem_is_within_the_declared_error_of_triangles() {
+    let Some(folder) = data() else { return };
+    let mut all = dems(&folder);
+    // The largest come last.
+    all.sort_by_key(|(dem, _)| std::fs::metadata(dem).unwrap().len());
+    for (dem, ingest) in &all {
+        for max_error in [0.0, 1.0] {
+            let started = Instant::now();
+            check(dem, ingest, TinOptions::default(), max_error);
+            println!("{}, within {max_error} m: {:.0?}", dem.display(), started.elapsed());
+        }
+    }
+    assert!(!all.is_empty());
+}
+
+#[test]
+fn too_little_memory_for_an_error_at_each_collapse_is_refused_before_anything_is_done() {
+    let folder = tempfile::tempdir().unwrap();
+    let dem = folder.path().join("dem.raw");
+    std::fs::write(&dem, vec![0; 2 * 4097 * 4097]).unwrap();
+    let arguments =
+        "build {}/dem.raw --raw 4097x4097:i16 --cell 30 -o {}/store --encoding tin --patch-error 5";
+    let refused = server(folder.path(), &format!("{arguments} --memory 127MiB"));
+    let wanted = ["--patch-error", "--memory 129MiB", "--patch-triangles", "4097 x 4097"];
+    assert_failed(&refused, 2, &wanted, "an error at each collapse in too little memory");
+    assert!(!folder.path().join("store").exists(), "something was written");
 }
 
 #[test]

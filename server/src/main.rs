@@ -461,6 +461,7 @@ fn refuse_build(sources: &[PathBuf], error: &BuildError) -> Failure {
         BuildError::MaxError { .. }
             | BuildError::Quantum(_)
             | BuildError::Memory { .. }
+            | BuildError::PatchErrorMemory { .. }
             | BuildError::TinOption { .. }
             | BuildError::Store(StoreError::Foreign { .. })
             | BuildError::Ingest(IngestError::Options { .. })
@@ -487,11 +488,16 @@ fn print_estimate(out: &mut impl Write, store: &Path, e: &Estimate) -> std::io::
         e.samples
     )?;
     writeln!(out, "  {:.1} % nodata", 100.0 * (1.0 - e.valid_samples as f64 / e.samples as f64))?;
-    writeln!(
-        out,
-        "  about {} diamonds, {} bytes of points ({:.2} bits a sample)",
-        e.diamonds, e.point_bytes, e.bits_per_sample
-    )?;
+    if e.diamonds > 0 || e.triangles == 0 {
+        writeln!(
+            out,
+            "  about {} diamonds, {} bytes of points ({:.2} bits a sample)",
+            e.diamonds, e.point_bytes, e.bits_per_sample
+        )?;
+    }
+    if e.triangles > 0 {
+        writeln!(out, "  about {} triangles of all levels, {} bytes", e.triangles, e.tin_bytes)?;
+    }
     let mebibytes = |bytes: u64| bytes as f64 / f64::from(1 << 20);
     writeln!(
         out,

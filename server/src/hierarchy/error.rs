@@ -88,6 +88,19 @@ pub enum BuildError {
         /// What it may be.
         expected: &'static str,
     },
+    /// An error at each collapse needs all samples of the largest diamond.
+    #[error(
+        "--patch-error looks at all {side} x {side} samples of the largest diamonds at each collapse, in half of --memory {}: say --memory {} or more, or --patch-triangles instead of it, which takes no more however large the source is",
+        mebibytes(*asked), mebibytes(*needed)
+    )]
+    PatchErrorMemory {
+        /// Samples along a side.
+        side: u64,
+        /// Bytes asked.
+        asked: u64,
+        /// Bytes needed.
+        needed: u64,
+    },
     /// A patch is larger than the format allows.
     #[error(
         "the triangles of diamond {centre:?}: {error}; give a larger --patch-error, or --patch-triangles instead of it"

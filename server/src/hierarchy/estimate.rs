@@ -3,7 +3,8 @@
 //! The source is cut into tiles of 4 x 4 patches. Some are read, to know how much of it has heights; some of
 //! those are built as if each were a source of its own, by the same code, in a temporary folder. Of their four
 //! levels the finer three, which add 7 of 8 points, are taken as they are, and so are those past the lattice;
-//! what the coarser ones cost follows from how the cost falls from level to level.
+//! what the coarser ones cost follows from how the cost falls from level to level. Triangles of a tile halve with each
+//! level, so its own levels are nearly all there will be.
 
 #![allow(
     clippy::cast_possible_truncation,
@@ -17,7 +18,7 @@ use super::plan::Plan;
 use super::tallies::Tallies;
 use super::transcribe::{find_quantum, to_quanta};
 use super::work::{Work, failure};
-use super::{Build, BuildError, Options, Stats, forest_of};
+use super::{Build, BuildError, Options, Stats, forest_of, tins};
 use crate::canvas::Canvas;
 use crate::ingest::{Grid, Source};
 use crate::progress::Progress;
@@ -62,12 +63,16 @@ pub struct Estimate {
     pub valid_samples: u64,
     /// Samples that the estimate rests on.
     pub sampled: u64,
-    /// Diamonds with a payload.
+    /// Diamonds with a payload of points.
     pub diamonds: u64,
-    /// Bytes of payloads.
+    /// Bytes of their payloads.
     pub point_bytes: u64,
-    /// Bits of payload for each sample that has a height.
+    /// Bits of payload of points for each sample that has a height.
     pub bits_per_sample: f64,
+    /// Triangles of all levels.
+    pub triangles: u64,
+    /// Bytes of their payloads.
+    pub tin_bytes: u64,
     /// Seconds, with the threads at hand.
     pub seconds: f64,
     /// The most memory that it takes.
@@ -93,7 +98,8 @@ struct Tile {
 pub fn estimate(source: &Source, options: &Options) -> Result<Estimate, BuildError> {
     let grid = source.grid();
     let forest = forest_of(grid, options)?;
-    let plan = Plan::new(forest, options.memory, 0)?;
+    tins::check(options)?;
+    let plan = Plan::new(forest, options.memory, tins::bytes(&forest, options)?)?;
     let quantum = find_quantum(source, options)?;
     let started = Instant::now();
     let side = 1u32 << (options.patch_log2 + TILE_LOG2);
@@ -123,16 +129,24 @@ pub fn estimate(source: &Source, options: &Options) -> Result<Estimate, BuildErr
         all.past_bytes += built.past_bytes;
         all.past_diamonds += built.past_diamonds;
         all.took += built.took;
+        all.triangles += built.triangles;
+        all.tin_bytes += built.tin_bytes;
+        all.triangulating += built.triangulating;
     }
     let bytes = of_all_levels(all.levels, built_valid) + all.past_bytes;
     let workers = rayon::current_num_threads().min(plan.workers);
     let building = all.took / workers as u32;
+    let triangulating = all.triangulating / tins::workers(options.memory) as u32;
     let per = |part: f64, of: u64| if of == 0 { 0.0 } else { part / of as f64 };
     let diamonds = diamonds + (per(all.past_diamonds, built_valid) * valid_samples as f64).round() as u64;
-    let point_bytes = (per(bytes, built_valid) * valid_samples as f64).round() as u64;
+    let diamonds = if options.points { diamonds } else { 0 };
+    let in_all = |part: f64| (per(part, built_valid) * valid_samples as f64).round() as u64;
+    let (point_bytes, tin_bytes, triangles) = (in_all(bytes), in_all(all.tin_bytes), in_all(all.triangles));
     let seconds = FIXED_SECONDS
         + samples as f64 * per(reading.as_secs_f64(), read)
-        + valid_samples as f64 * per(building.as_secs_f64(), built_valid) * WHOLE_TO_TILE;
+        + valid_samples as f64 * per(building.as_secs_f64(), built_valid) * WHOLE_TO_TILE
+        + valid_samples as f64 * per(triangulating.as_secs_f64(), built_valid);
+    let tin_disk = if options.tin.is_some() { samples * tins::DISK_BYTES + 2 * tin_bytes } else { 0 };
     Ok(Estimate {
         samples,
         valid_samples,
@@ -141,9 +155,11 @@ pub fn estimate(source: &Source, options: &Options) -> Result<Estimate, BuildErr
         point_bytes,
         bits_per_sample: per(point_bytes as f64 * 8.0, valid_samples),
         seconds,
-        memory_bytes: plan.memory,
+        triangles,
+        tin_bytes,
+        memory_bytes: plan.memory.max(tins::memory_max(&forest, options)?),
         // A third more for the coarser planes; payloads in the spool and in the packs.
-        disk_bytes: samples * 16 / 3 + 2 * point_bytes + diamonds * JOURNAL_BYTES,
+        disk_bytes: samples * 16 / 3 + 2 * point_bytes + diamonds * JOURNAL_BYTES + tin_disk,
     })
 }
 
@@ -244,6 +260,11 @@ struct Built {
     past_diamonds: f64,
     /// How long coding and comparing took.
     took: Duration,
+    /// Of all levels of a source that has many such tiles.
+    triangles: f64,
+    tin_bytes: f64,
+    /// How long these took.
+    triangulating: Duration,
 }
 
 /// Builds a tile in a temporary folder.
@@ -276,9 +297,19 @@ fn build_tile(tile: &Tile, grid: &Grid, options: &Options) -> Result<Built, Buil
         grid: &grid,
     };
     let started = Instant::now();
-    let coarse = build.coarse_levels()?;
-    build.chunks(&coarse)?;
+    if options.points {
+        let coarse = build.coarse_levels()?;
+        build.chunks(&coarse)?;
+    }
     let took = started.elapsed();
+    let started = Instant::now();
+    let tin_forest = options.tin.map(|tin| tins::forest_of(&forest, &tin)).transpose()?;
+    let nothing = tin_forest.map(|forest| (forest, tins::Found::new(forest)));
+    let layer = build.triangles(nothing, options, &tile.stats)?.map(|(layer, _)| layer);
+    let triangulating = started.elapsed();
+    // As the levels above have half as many each, all of them have as many as the tile's coarsest.
+    let all = layer.as_ref().map_or(1.0, |layer| 1.0 + 1.0 / (f64::from(layer.forest.levels()).exp2() - 1.0));
+    let (triangles, tin_bytes) = layer.map_or((0, 0), |layer| (layer.triangles, layer.bytes));
     let tallies = build.tallies.lock().unwrap_or_else(std::sync::PoisonError::into_inner).take();
     let [w, h] = forest.size();
     let bytes = |d: Diamond| {
@@ -288,7 +319,13 @@ fn build_tile(tile: &Tile, grid: &Grid, options: &Options) -> Result<Built, Buil
         let half = x == 0 || y == 0 || x == w || y == h;
         bytes - if half { bytes.min(FIXED_BYTES) / 2.0 } else { 0.0 }
     };
-    let mut built = Built { took, ..Built::default() };
+    let mut built = Built {
+        took,
+        triangles: triangles as f64 * all,
+        tin_bytes: tin_bytes as f64 * all,
+        triangulating,
+        ..Built::default()
+    };
     for (level, sum) in (0..forest.lattice_levels()).zip(&mut built.levels) {
         *sum = forest.diamonds(level).map(bytes).sum();
     }

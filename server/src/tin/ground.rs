@@ -21,12 +21,6 @@ pub struct Ground<'a> {
     pub heights: &'a [i32],
 }
 
-/// The least and greatest of three.
-fn range(values: [i64; 3]) -> (i64, i64) {
-    let [a, b, c] = values;
-    (a.min(b).min(c), a.max(b).max(c))
-}
-
 #[allow(
     clippy::cast_possible_truncation,
     clippy::cast_possible_wrap,
@@ -41,12 +35,20 @@ impl Ground<'_> {
         self.heights[j * self.width + i]
     }
 
+    /// Whether there is a sample at a vertex, with a height.
+    pub(super) fn has(&self, v: Vertex) -> bool {
+        self.sample(v).is_some()
+    }
+
     /// How far a vertex is from its sample, if that lies in the rectangle and has a height.
     fn off(&self, v: Vertex) -> f64 {
+        self.sample(v).map_or(0.0, |h| v.height.abs_diff(h).into())
+    }
+
+    fn sample(&self, v: Vertex) -> Option<i32> {
         let step = |w: u32, o: u32| w.checked_sub(o).map(|w| w as usize);
-        let (Some(i), Some(j)) = (step(v.x, self.origin[0]), step(v.y, self.origin[1])) else { return 0.0 };
-        let sample = self.heights.get(j * self.width + i).filter(|h| i < self.width && **h != NODATA);
-        sample.map_or(0.0, |h| v.height.abs_diff(*h).into())
+        let (i, j) = (step(v.x, self.origin[0])?, step(v.y, self.origin[1])?);
+        self.heights.get(j * self.width + i).filter(|h| i < self.width && **h != NODATA).copied()
     }
 
     /// Whether the ground may be a plane around a sample: it is not where it bends along one axis. Only of samples whose
@@ -78,9 +80,9 @@ impl Ground<'_> {
             [step(v.x, self.origin[0]), step(v.y, self.origin[1])]
         };
         let corners = [local(a), local(b), local(c)];
+        let sides = Sides::new(corners);
         let rows = (self.heights.len() / self.width) as i64;
-        let (low, high) = range(corners.map(|p| p[1]));
-        let (low, high) = (low.max(0), high.min(rows - 1));
+        let (low, high) = (sides.low[1].max(0), sides.high[1].min(rows - 1));
         // The plane, times D: D h = D h_a + east (x - x_a) + north (y - y_a).
         let [ab, ac] = [b, c].map(|v| {
             let step = |w: u32, o: u32| f64::from(w.wrapping_sub(o).cast_signed());
@@ -93,7 +95,7 @@ impl Ground<'_> {
         let limit = limit * doubled;
         let mut worst = 0.0f64;
         for y in low..=high {
-            let Some((from, to)) = span(&corners, y, self.width as i64 - 1) else { continue };
+            let Some((from, to)) = sides.span(y, self.width as i64 - 1) else { continue };
             let row = &self.heights[y as usize * self.width..][from as usize..=to as usize];
             let here = start + north * y as f64 + east * from as f64;
             worst = worst.max(run(row, here, east, doubled));
@@ -105,26 +107,50 @@ impl Ground<'_> {
     }
 }
 
-/// The samples of a row that lie in a triangle, edges included, within 0 to `last`.
-fn span(corners: &[[i64; 2]; 3], y: i64, last: i64) -> Option<(i64, i64)> {
-    let (mut west, mut east) = (f64::MAX, f64::MIN);
-    for i in 0..3 {
-        let (p, q) = (corners[i], corners[if i == 2 { 0 } else { i + 1 }]);
-        if (p[1] > y && q[1] > y) || (p[1] < y && q[1] < y) {
-            continue;
-        }
-        if p[1] == q[1] {
-            west = west.min(p[0].min(q[0]) as f64);
-            east = east.max(p[0].max(q[0]) as f64);
+/// A triangle's sides, from its lowest corner up: one goes all the way, the other one by the corner between.
+struct Sides {
+    low: [i64; 2],
+    middle: [i64; 2],
+    high: [i64; 2],
+    /// Whether the side by the middle lies in the east.
+    is_east: bool,
+}
+
+impl Sides {
+    /// Those of a triangle that turns left.
+    fn new([a, b, c]: [[i64; 2]; 3]) -> Self {
+        // Turned until the lowest comes first; what follows it is in the east.
+        let [low, next, last] = if a[1] <= b[1] && a[1] <= c[1] {
+            [a, b, c]
+        } else if b[1] <= c[1] {
+            [b, c, a]
         } else {
-            // A quotient that is whole comes out whole, and no other does: numbers are below 2^26.
-            let x = p[0] as f64 + ((y - p[1]) * (q[0] - p[0])) as f64 / (q[1] - p[1]) as f64;
-            west = west.min(x);
-            east = east.max(x);
-        }
+            [c, a, b]
+        };
+        let is_east = next[1] <= last[1];
+        let (middle, high) = if is_east { (next, last) } else { (last, next) };
+        Self { low, middle, high, is_east }
     }
-    let (from, to) = (ceil(west).max(0), (-ceil(-east)).min(last));
-    (west <= east && from <= to).then_some((from, to))
+
+    /// The samples of a row that lie in the triangle, edges included, within 0 to `last`.
+    fn span(&self, y: i64, last: i64) -> Option<(i64, i64)> {
+        let Self { low, middle, high, .. } = *self;
+        // A quotient that is whole comes out whole, and no other does: numbers are below 2^26.
+        let at = |p: [i64; 2], q: [i64; 2]| {
+            p[0] as f64 + ((y - p[1]) * (q[0] - p[0])) as f64 / (q[1] - p[1]) as f64
+        };
+        let all = at(low, high);
+        let by = if y < middle[1] {
+            at(low, middle)
+        } else if y > middle[1] {
+            at(middle, high)
+        } else {
+            middle[0] as f64
+        };
+        let (west, east) = if self.is_east { (all, by) } else { (by, all) };
+        let (from, to) = (ceil(west).max(0), (-ceil(-east)).min(last));
+        (from <= to).then_some((from, to))
+    }
 }
 
 /// The least whole number at or above `x`. Without a call, which `f64::ceil` is where a machine is taken for an old one.
@@ -151,4 +177,40 @@ fn run(row: &[i32], start: f64, east: f64, doubled: f64) -> f64 {
     }
     let most = worst.into_iter().fold(0.0, f64::max);
     rest.iter().enumerate().map(|(i, h)| distance(lanes.len() * LANES + i, *h)).fold(most, f64::max)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        /// Against a test of each sample by itself; corners may lie beyond the samples.
+        #[test]
+        fn the_distance_is_that_of_the_farthest_sample_covered(
+            corners in prop::array::uniform3((0u32..24, 0u32..24, -500i32..500)),
+            heights in prop::collection::vec(prop_oneof![9 => -500i32..500, 1 => Just(NODATA)], 12 * 14),
+            origin in prop::array::uniform2(0u32..12),
+        ) {
+            let ground = Ground { origin, width: 12, heights: &heights };
+            let [a, b, c] = corners.map(|(x, y, height)| Vertex { x, y, height });
+            prop_assume!(turn(a, b, c) > 0);
+            let mut expected = 0.0f64;
+            for (i, sample) in heights.iter().enumerate().filter(|(_, h)| **h != NODATA) {
+                let at = Vertex {
+                    x: origin[0] + u32::try_from(i % 12).unwrap(),
+                    y: origin[1] + u32::try_from(i / 12).unwrap(),
+                    height: *sample,
+                };
+                let shares = [turn(at, b, c), turn(a, at, c), turn(a, b, at)];
+                if shares.iter().all(|share| *share >= 0) {
+                    let sum: i64 = shares.iter().zip([a, b, c]).map(|(s, v)| s * i64::from(v.height)).sum();
+                    let plane = sum as f64 / turn(a, b, c) as f64;
+                    expected = expected.max((plane - f64::from(*sample)).abs());
+                }
+            }
+            let found = ground.distance([a, b, c], f64::INFINITY);
+            prop_assert!((found - expected).abs() < 1e-9 * (1.0 + expected), "{found}, expected {expected}");
+        }
+    }
 }

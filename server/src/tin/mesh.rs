@@ -172,9 +172,9 @@ impl Mesh {
         self.first[v as usize] != NONE
     }
 
-    /// Corners of the triangles that have not vanished.
-    pub(super) fn triangles(&self) -> impl Iterator<Item = [u32; 3]> {
-        self.origins.as_chunks::<3>().0.iter().filter(|t| t[0] != NONE).copied()
+    /// The triangles that have not vanished: their numbers and corners.
+    pub(super) fn triangles(&self) -> impl Iterator<Item = (usize, [u32; 3])> {
+        self.origins.as_chunks::<3>().0.iter().copied().enumerate().filter(|(_, t)| t[0] != NONE)
     }
 
     /// Half-edges without a twin.

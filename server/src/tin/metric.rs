@@ -21,10 +21,11 @@
 //! **The bend** of a border at v between its neighbours w and u is (1 - cos of the turn) * the square of the
 //! length of the edge that is moved along: an area, as the others are.
 
+use super::fan::Fan;
 use super::mesh::{Mesh, Star};
 use super::{Metric, Scale, Vertex};
 
-type Vector = [f64; 3];
+pub(super) type Vector = [f64; 3];
 
 /// From one vertex to another, in metres.
 pub(super) fn between(scale: &Scale, a: Vertex, b: Vertex) -> Vector {
@@ -156,33 +157,16 @@ impl Costs {
         (ways.map(|to| self.quadric(mesh, star, to)).fold(f64::INFINITY, f64::min), flat)
     }
 
-    /// What it costs to move a star's centre into the rim's vertex `to`; `None` if a triangle would turn over.
-    pub(super) fn cost(&self, mesh: &Mesh, star: &Star, to: usize) -> Option<f64> {
-        let u = star.rim[to];
-        let point = |v: u32| mesh.points[v as usize];
-        let mut sum = 0.0;
-        for (i, spoke) in star.spokes.iter().enumerate() {
-            let edge = star.edge(i);
-            if edge.contains(&u) {
-                continue;
-            }
-            let corners = [point(u), point(edge[0]), point(edge[1])];
-            if turn(corners[0], corners[1], corners[2]) <= 0 {
-                return None;
-            }
-            if self.quadrics.is_empty() {
-                let (old, area) = self.vectors[*spoke as usize / 3];
-                let (new, area_new) = with_length(area_vector(&self.scale, corners));
-                sum += 0.5 * (area + area_new) * (1.0 - dot(old, new) / (area * area_new));
-            }
-        }
+    /// What it costs to move a star's centre into the rim's vertex `to`, as the fan has just looked at it.
+    pub(super) fn cost(&self, mesh: &Mesh, star: &Star, fan: &Fan, to: usize) -> f64 {
         if !self.quadrics.is_empty() {
-            return Some(self.quadric(mesh, star, to));
+            return self.quadric(mesh, star, to);
         }
+        let changes = fan.cost(&self.scale, to, |i| self.vectors[star.spokes[i] as usize / 3]);
         if star.border {
-            sum += self.lambda * self.bend(mesh, star, usize::from(to > 0));
+            return changes + self.lambda * self.bend(mesh, star, usize::from(to > 0));
         }
-        Some(sum)
+        changes
     }
 
     /// The bend of the border where it is moved along its outgoing edge, or (1) its incoming one.

@@ -19,11 +19,11 @@
 //! out, and the error is the diamond's width.
 
 mod collapse;
+mod fan;
 mod ground;
 mod mesh;
 mod metric;
 mod patch;
-mod queue;
 
 pub use collapse::Until;
 pub use ground::Ground;

@@ -1,6 +1,6 @@
 //! The mesh of a triangle of the bintree; four of them merged, simplified, and cut in two.
 
-use super::collapse::{Passed, Simplifier, Square, Until, distance_to};
+use super::collapse::{Passed, Simplifier, Square, Until, at_least, distance_to};
 use super::ground::Ground;
 use super::mesh::{Mesh, NONE};
 use super::metric::{between, length, turn};
@@ -15,7 +15,7 @@ use std::collections::{HashMap, HashSet};
 /// on a straight line between others. It has the mesh to its left.
 pub type Border = ([u32; 2], Vec<[u32; 2]>);
 
-/// The mesh of one triangle of the bintree. Takes 24 bytes a triangle, and 8 for each point that its borders stand for.
+/// The mesh of one triangle of the bintree. Takes 28 bytes a triangle, and 8 for each point that its borders stand for.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Tin {
     /// In no order; some of the same place where triangles touch in a point alone.
@@ -24,6 +24,8 @@ pub struct Tin {
     pub triangles: Vec<[u32; 3]>,
     /// Those borders along nodata that are not the source's own.
     pub borders: Vec<Border>,
+    /// How far samples are from each triangle, in quanta, a little more at most; none if that is not known.
+    pub errors: Vec<f32>,
     /// How far what was left out since there was no room for it lies from what is there, in metres.
     pub lost: f64,
 }
@@ -35,6 +37,8 @@ pub struct Merged {
     pub patch: Patch,
     /// See [`Tin::borders`].
     pub borders: Vec<Border>,
+    /// See [`Tin::errors`].
+    pub errors: Vec<f32>,
     /// See [`Tin::lost`].
     pub lost: f64,
     /// Whether it is the source's own mesh.
@@ -48,6 +52,8 @@ pub struct Simplified {
     pub halves: [Tin; 2],
     /// The largest distance between their borders and the source's, in metres.
     pub apart: f64,
+    /// The largest vertical distance between them and the samples that they cover, in quanta, if that is known.
+    pub vertical: Option<f64>,
 }
 
 /// A lattice point of the forest as a vertex.
@@ -113,6 +119,7 @@ pub fn source(forest: &Forest, d: Diamond, ground: Ground<'_>) -> Merged {
             }
         }
     }
+    merged.errors = vec![0.0; merged.patch.triangles.len()];
     merged
 }
 
@@ -143,10 +150,14 @@ pub fn merge(forest: &Forest, d: Diamond, tins: [&Tin; 4]) -> Merged {
             .collect();
         let renumber = |v: &u32| numbers[*v as usize];
         merged.patch.triangles.extend(tin.triangles.iter().map(|t| t.each_ref().map(renumber)));
+        merged.errors.extend_from_slice(&tin.errors);
         merged.patch.ends[i] = u32::try_from(merged.patch.triangles.len()).unwrap_or(NONE);
         merged
             .borders
             .extend(tin.borders.iter().map(|(edge, points)| (edge.each_ref().map(renumber), points.clone())));
+    }
+    if merged.errors.len() < merged.patch.triangles.len() {
+        merged.errors.clear();
     }
     merged
 }
@@ -160,16 +171,17 @@ pub fn simplify(forest: &Forest, d: Diamond, merged: &Merged, rules: &Rules, unt
     let square = square(forest, d);
     let mesh = Mesh::new(&merged.patch.vertices, &merged.patch.triangles);
     let passed = find_passed(&mesh, merged);
-    let mut simplifier = Simplifier::new(mesh, passed, merged.is_source, square, rules, until);
+    let errors = find_errors(merged, &until);
+    let mut simplifier = Simplifier::new(mesh, passed, errors, merged.is_source, square, rules, until);
     simplifier.run();
-    let Simplifier { mesh, passed, .. } = simplifier;
+    let Simplifier { mesh, passed, errors, .. } = simplifier;
     let point = |v: u32| mesh.points[v as usize];
     let distance = |(h, points): (&u32, &Vec<[u32; 2]>)| {
         let ends = [point(mesh.origin(*h)), point(mesh.target(*h))];
         points.iter().map(|p| distance_to(&rules.scale, *p, ends)).fold(0.0, f64::max)
     };
     let apart = passed.iter().map(distance).fold(0.0, f64::max) + merged.lost;
-    let mut simplified = Simplified { halves: cut(&mesh, passed, &square), apart };
+    let mut simplified = Simplified { halves: cut(&mesh, passed, &errors, &square), apart, vertical: None };
     for half in &mut simplified.halves {
         half.lost = merged.lost;
         if half.triangles.len() > rules.triangles_max || half.vertices.len() > rules.vertices_max {
@@ -179,7 +191,21 @@ pub fn simplify(forest: &Forest, d: Diamond, merged: &Merged, rules: &Rules, unt
             simplified.apart = simplified.apart.max(half.lost);
         }
     }
+    if !errors.is_empty() {
+        let all = simplified.halves.iter().flat_map(|half| &half.errors);
+        simplified.vertical = Some(all.copied().fold(0.0, f32::max).into());
+    }
     simplified
+}
+
+/// How far samples are from each triangle, in quanta: measured where that is asked and not known.
+fn find_errors(merged: &Merged, until: &Until<'_>) -> Vec<f32> {
+    let (Until::Within { ground, .. } | Until::Error { ground, .. }) = until else { return Vec::new() };
+    if !merged.errors.is_empty() {
+        return merged.errors.clone();
+    }
+    let corners = merged.patch.triangles.iter().map(|t| t.map(|v| merged.patch.vertices[v as usize]));
+    corners.map(|t| at_least(ground.distance(t, f64::INFINITY))).collect()
 }
 
 /// The largest triangles of a half, as many as there may be. Only where nodata tears the ground to shreds can there be
@@ -199,6 +225,7 @@ fn with_room(half: &Tin, rules: &Rules) -> Tin {
         if kept.triangles.len() == rules.triangles_max || kept.vertices.len() + fresh > rules.vertices_max {
             break;
         }
+        kept.errors.extend(half.errors.get(i));
         kept.triangles.push(t.map(|v| {
             let number = &mut numbers[v as usize];
             if *number == NONE {
@@ -241,16 +268,17 @@ fn find_passed(mesh: &Mesh, merged: &Merged) -> Passed {
 }
 
 /// Cuts a mesh along the hypotenuse.
-fn cut(mesh: &Mesh, mut passed: Passed, square: &Square) -> [Tin; 2] {
+fn cut(mesh: &Mesh, mut passed: Passed, errors: &[f32], square: &Square) -> [Tin; 2] {
     let mut halves = [Tin::default(), Tin::default()];
     let mut numbers = [vec![NONE; mesh.points.len()], vec![NONE; mesh.points.len()]];
     let side = |t: [u32; 3]| {
         let turns = t.map(|v| turn(square.a, square.b, mesh.points[v as usize]));
         usize::from(turns.into_iter().any(|turn| turn > 0))
     };
-    for t in mesh.triangles() {
+    for (number, t) in mesh.triangles() {
         let i = side(t);
         let (half, numbers) = (&mut halves[i], &mut numbers[i]);
+        half.errors.extend(errors.get(number));
         half.triangles.push(t.map(|v| {
             let number = &mut numbers[v as usize];
             if *number == NONE {

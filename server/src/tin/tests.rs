@@ -68,9 +68,7 @@ fn build(field: &Field, rules: &Rules, until: impl Fn(u32) -> Until<'static>) ->
                 Until::Error { vertical, border, .. } => {
                     Until::Error { ground: field.ground(), vertical, border }
                 }
-                Until::Within { triangles, start, .. } => {
-                    Until::Within { triangles, ground: field.ground(), start }
-                }
+                Until::Within { triangles, .. } => Until::Within { triangles, ground: field.ground() },
                 Until::Triangles(n) => Until::Triangles(n),
             };
             let simplified = simplify(&deep, d, &merged, rules, until);
@@ -80,6 +78,12 @@ fn build(field: &Field, rules: &Rules, until: impl Fn(u32) -> Until<'static>) ->
                     let corners = t.map(|v| half.vertices[v as usize]);
                     vertical = vertical.max(field.ground().distance(corners, f64::INFINITY));
                 }
+            }
+            if let Some(known) = simplified.vertical {
+                assert!(
+                    (vertical..=vertical * 1.000_001).contains(&known),
+                    "level {level}: {known}, {vertical}"
+                );
             }
             if let Until::Error { vertical: limit, border, .. } = until {
                 assert!(
@@ -400,7 +404,7 @@ fn a_limit_that_grows_ends_at_the_count_with_smaller_errors() {
         let until = |within: bool| {
             move |level: u32| match (level == finest, within) {
                 (true, _) => Until::Error { ground: nowhere(), vertical: 0.0, border: 0.0 },
-                (_, true) => Until::Within { triangles: 20, ground: nowhere(), start: 0.5 },
+                (_, true) => Until::Within { triangles: 20, ground: nowhere() },
                 (_, false) => Until::Triangles(20),
             }
         };

@@ -13,7 +13,7 @@
 //!
 //! Memory: a tile's samples and the meshes of one diamond a worker, [`WINDOW_SAMPLES`] at most, unless an error is to
 //! be kept at each collapse: then all samples of a diamond, of the largest ones one by one. Disk: the halves of two
-//! levels, some 20 bytes a sample in all.
+//! levels, some 30 bytes a sample in all.
 
 mod halves;
 mod tile;
@@ -87,6 +87,9 @@ const BASE_BYTES: u64 = 96 << 20;
 /// Of a worker: samples, meshes, halves.
 const WORKER_BYTES: u64 = 128 << 20;
 
+/// Of work files for each sample, at most.
+pub(super) const DISK_BYTES: u64 = 30;
+
 /// 32 (known) + 16 (place) + 40 (spool) + 40 (pack) + 32 (directory) + 16 (entry).
 const DIAMOND_BYTES: u64 = 176;
 
@@ -108,10 +111,33 @@ pub(super) fn check(options: &Options) -> Result<(), BuildError> {
     }
 }
 
-/// Bytes that the diamonds of triangles need, whatever else the memory is used for.
+/// Bytes that the diamonds of triangles need, whatever else the memory is used for. Refuses what would be found too little
+/// only when the largest diamonds are reached, late in the build.
 pub(super) fn bytes(layer: &Forest, options: &Options) -> Result<u64, BuildError> {
     let Some(tin) = options.tin else { return Ok(0) };
-    Ok(places_of_all(&forest_of(layer, &tin)?) * DIAMOND_BYTES)
+    let forest = forest_of(layer, &tin)?;
+    let window = window_bytes(&forest, 1);
+    if tin.patch_error.is_some() && window > options.memory / 2 {
+        let side = (1 << forest.root_log2()) + 1;
+        return Err(BuildError::PatchErrorMemory { side, asked: options.memory, needed: 2 * window });
+    }
+    Ok(places_of_all(&forest) * DIAMOND_BYTES)
+}
+
+/// The most memory that triangles take; 0 if there are none.
+pub(super) fn memory_max(layer: &Forest, options: &Options) -> Result<u64, BuildError> {
+    if options.tin.is_none() {
+        return Ok(0);
+    }
+    let all = BASE_BYTES + workers(options.memory) as u64 * WORKER_BYTES + bytes(layer, options)?;
+    // An error at each collapse may want half of what was asked.
+    Ok(if options.tin.is_some_and(|tin| tin.patch_error.is_some()) { all.max(options.memory) } else { all })
+}
+
+/// Bytes of all samples of a diamond.
+fn window_bytes(forest: &Forest, level: u32) -> u64 {
+    let side = 1u64 << (forest.root_log2() - level / 2);
+    4 * (side + 1) * (side + 1)
 }
 
 /// Workers that the memory allows.
@@ -295,28 +321,26 @@ impl Tins<'_> {
         let failed = AtomicBool::new(false);
         let go_on = || !self.work.progress.is_stopping() && !failed.load(Ordering::Relaxed);
         let place = |d: Diamond| read(found).places.get(d);
-        let worked: Result<(), BuildError> =
-            (0..self.workers_at(level)?).into_par_iter().try_for_each(|_| {
-                while go_on() {
-                    let position = next.fetch_add(1, Ordering::Relaxed);
-                    let Some(diamonds) = tiles.get(position) else { break };
-                    let number = u32::try_from(position).unwrap_or(u32::MAX);
-                    if !read(found).tiles.contains(&(level, number)) {
-                        let input =
-                            input.map(|halves| (halves, &place as &(dyn Fn(Diamond) -> Place + Sync)));
-                        let tile = self
-                            .tile(level, number, diamonds, input, output)
-                            .inspect_err(|_| failed.store(true, Ordering::Relaxed))?;
-                        write(found).add(&self.forest, &tile);
-                        self.done.fetch_add(1, Ordering::Relaxed);
-                        if self.work.journal.note(&Record::Tile(tile)) {
-                            self.work.checkpoint_with(self.canvas, || output.sync())?;
-                        }
+        let worked: Result<(), BuildError> = (0..self.workers_at(level)).into_par_iter().try_for_each(|_| {
+            while go_on() {
+                let position = next.fetch_add(1, Ordering::Relaxed);
+                let Some(diamonds) = tiles.get(position) else { break };
+                let number = u32::try_from(position).unwrap_or(u32::MAX);
+                if !read(found).tiles.contains(&(level, number)) {
+                    let input = input.map(|halves| (halves, &place as &(dyn Fn(Diamond) -> Place + Sync)));
+                    let tile = self
+                        .tile(level, number, diamonds, input, output)
+                        .inspect_err(|_| failed.store(true, Ordering::Relaxed))?;
+                    write(found).add(&self.forest, &tile);
+                    self.done.fetch_add(1, Ordering::Relaxed);
+                    if self.work.journal.note(&Record::Tile(tile)) {
+                        self.work.checkpoint_with(self.canvas, || output.sync())?;
                     }
-                    self.work.progress.advance(diamonds.len() as u64);
                 }
-                Ok(())
-            });
+                self.work.progress.advance(diamonds.len() as u64);
+            }
+            Ok(())
+        });
         if let Err(error) = worked {
             // What is done may still be kept; the first failure is the one to tell.
             let _ = self.work.checkpoint_with(self.canvas, || output.sync());
@@ -332,16 +356,10 @@ impl Tins<'_> {
     }
 
     /// How many tiles of a level may be worked on at once: one, where the samples of two diamonds would be too many.
-    fn workers_at(&self, level: u32) -> Result<usize, BuildError> {
-        if self.options.patch_error.is_none() {
-            return Ok(self.workers);
-        }
-        let side = 1u64 << (self.forest.root_log2() - level / 2);
-        let bytes = 4 * (side + 1) * (side + 1);
-        if bytes > self.memory / 2 {
-            return Err(BuildError::Memory { asked: self.memory, needed: 2 * bytes });
-        }
-        Ok(if bytes * self.workers as u64 > self.memory / 2 { 1 } else { self.workers })
+    fn workers_at(&self, level: u32) -> usize {
+        let bytes = window_bytes(&self.forest, level);
+        let one = self.options.patch_error.is_some() && bytes * self.workers as u64 > self.memory / 2;
+        if one { 1 } else { self.workers }
     }
 
     /// The layer's part in the scene, but for the bytes of its index, and what that index says.

@@ -135,29 +135,27 @@ impl Tins<'_> {
         if d.level() == 0 {
             return Ok(one);
         }
-        let until = self.until(d.level(), merged, window);
+        let until = self.until(d.level(), window);
         let simplified = simplify(forest, d, merged, &self.rules(), until);
         one.apart = simplified.apart;
-        one.vertical = match window {
-            Some(window) => distance(&simplified.halves, ground(window)),
-            None => self.distance_in_bands(d, &simplified.halves)?,
+        one.vertical = match (simplified.vertical, window) {
+            (Some(vertical), _) => vertical,
+            (None, Some(window)) => distance(&simplified.halves, ground(window)),
+            (None, None) => self.distance_in_bands(d, &simplified.halves)?,
         };
         one.halves = output.put(&simplified.halves).map_err(&failed)?;
         Ok(one)
     }
 
     /// Where the simplification of a diamond stops.
-    fn until<'b>(&self, level: u32, merged: &Merged, window: Option<&'b Window>) -> Until<'b> {
+    fn until<'b>(&self, level: u32, window: Option<&'b Window>) -> Until<'b> {
         let triangles = self.options.patch_triangles as usize;
         let Some(ground) = window.map(ground) else { return Until::Triangles(triangles) };
         if let Some(error) = self.options.patch_error {
             let above = f64::from(self.forest.levels() - 1 - level);
             return self.limit(error * (above / 2.0).exp2(), ground);
         }
-        let patch = &merged.patch;
-        let corners = patch.triangles.iter().map(|t| t.map(|v| patch.vertices[v as usize]));
-        let start = corners.map(|t| ground.distance(t, f64::INFINITY)).fold(0.0, f64::max);
-        Until::Within { triangles, ground, start }
+        Until::Within { triangles, ground }
     }
 
     /// Stops at an error in metres.
@@ -185,8 +183,7 @@ impl Tins<'_> {
             }
             let merged = if loses { self.of_finer(deep, c, ground, finest) } else { source(deep, c, ground) };
             let simplified = simplify(deep, c, &merged, &self.rules(), until);
-            // Where nothing may be lost nothing was.
-            let vertical = if loses { distance(&simplified.halves, ground) } else { 0.0 };
+            let vertical = simplified.vertical.unwrap_or_else(|| distance(&simplified.halves, ground));
             finest.insert(c, (simplified, vertical));
         }
         quarters(deep, d, children, finest)
