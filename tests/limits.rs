@@ -54,7 +54,8 @@ fn until_answered(url: &str, path: &str, words: &str) -> String {
     loop {
         let mut stream = connect(url);
         // Whoever has no place is cut off, at times before the request is written.
-        let found = try_request(&mut stream, path).map_or_else(|error| error.to_string(), |()| answer(&mut stream));
+        let found =
+            try_request(&mut stream, path).map_or_else(|error| error.to_string(), |()| answer(&mut stream));
         if found.contains(words) {
             return found;
         }
@@ -98,6 +99,23 @@ fn who_is_slow_to_ask_or_silent_is_cut_off() {
         assert!(is_closed(&mut silent), "{path:?}");
     }
     until_answered(&served.address, "/health", "200 OK");
+}
+
+#[test]
+fn who_waits_before_asking_again_has_longer_than_a_head() {
+    let world = World::sample(129, 0.0);
+    let limits = Limits { head: milliseconds(300), still: milliseconds(5000), ..Limits::default() };
+    let served = serve_within(&[world.folder.path().join("store")], limits);
+    let mut stream = connect(&served.address);
+    for _ in 0..3 {
+        request(&mut stream, "/health");
+        assert!(answer(&mut stream).contains("200 OK"));
+        sleep(milliseconds(700));
+    }
+    // The next head has its own deadline all the same.
+    let started = Instant::now();
+    stream.write_all(b"GET /hea").unwrap();
+    assert!(is_closed(&mut stream) && started.elapsed() < milliseconds(3000), "{:?}", started.elapsed());
 }
 
 #[test]

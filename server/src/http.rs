@@ -6,6 +6,7 @@
 //! batches and heights leave the async threads.
 
 mod accept;
+mod front;
 mod limits;
 mod scenes;
 mod still;
@@ -18,9 +19,8 @@ use crate::store::{Key, Kind, Store, StoreError, zones};
 use crate::stream::Stream;
 use axum::Router;
 use axum::body::{Body, Bytes};
-use axum::extract::{Path as UrlPath, Query, Request, State};
-use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
-use axum::middleware::Next;
+use axum::extract::{Path as UrlPath, Query, State};
+use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::{MethodRouter, get};
 use diamantina_protocol::bintree::Forest;
@@ -28,6 +28,7 @@ use diamantina_protocol::index;
 use diamantina_protocol::message::{
     self, BATCH_MAX, Catalogue, FrameHeader, Layer, PAYLOAD_BYTES_MAX, Problem, STREAM_MAX, Scene, Status,
 };
+use front::Front;
 use scenes::Found;
 use std::collections::HashMap;
 use std::io::{Read as _, Write as _};
@@ -147,7 +148,8 @@ impl Server {
             if self.limits.reload > 0 {
                 tokio::spawn(watch(Arc::clone(&self.scenes), self.limits));
             }
-            accept::serve(listener, router(self.scenes), self.limits, stop).await;
+            let front = Front::new(router(self.scenes), &self.limits);
+            accept::serve(listener, front, self.limits, stop).await;
             Ok(())
         })
     }
@@ -243,20 +245,6 @@ impl From<StoreError> for Refusal {
         tracing::error!(%error, "store");
         Self::new(StatusCode::INTERNAL_SERVER_ERROR, "the store is damaged here: the log says where")
     }
-}
-
-/// Headers that every answer has: any page may read it, and no proxy may guess its type.
-async fn common_headers(request: Request, next: Next) -> Response {
-    let refused = !matches!(*request.method(), Method::GET | Method::HEAD | Method::OPTIONS);
-    let mut response = next.run(request).await;
-    let headers = response.headers_mut();
-    headers.insert(header::ACCESS_CONTROL_ALLOW_ORIGIN, HeaderValue::from_static("*"));
-    headers.insert(header::ACCESS_CONTROL_EXPOSE_HEADERS, HeaderValue::from_static("etag, content-length"));
-    headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
-    if refused {
-        headers.insert(header::ALLOW, HeaderValue::from_static("GET, HEAD"));
-    }
-    response
 }
 
 /// An answer with an ETag, or 304 where the client has it already.

@@ -26,11 +26,11 @@ pub struct Limits {
     /// Seconds for which a version is served after another took its place
     #[arg(long, default_value_t = 300, value_name = "SECONDS")]
     pub grace: u32,
-    /// How long the head of a request may take; over HTTP/1.1 the wait for the next request counts, as hyper's timer
-    /// begins with the answer before.
+    /// How long the head of a request may take, from its first byte.
     #[arg(skip = Duration::from_secs(10))]
     pub head: Duration,
-    /// How long a connection may stand still, whether it waits for a request or for a reader.
+    /// How long a connection may stand still, whether it waits for a request or for a reader; over HTTP/2, how long
+    /// nothing may be asked.
     #[arg(skip = Duration::from_secs(30))]
     pub still: Duration,
     /// How long one answer may take in all.
