@@ -3,18 +3,22 @@
 //! axum's own loop sets no deadlines and no bounds. Here each connection has a place among all and among those of its
 //! address, and is given up when it stands still or takes too long to ask.
 
-use super::front::Front;
+use super::access::subscriber;
+use super::front::{Connection, Front};
 use super::limits::{HEAD_BYTES_MAX, Limits, STREAMS_MAX, URI_BYTES_MAX};
-use super::still::{Activity, Patience, Watched};
+use super::metrics::Metrics;
+use super::still::{Activity, Noted, Patience, Watched};
+use super::tls::Tls;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto;
-use hyper_util::server::graceful::GracefulShutdown;
+use hyper_util::server::graceful::{GracefulShutdown, Watcher};
 use std::collections::HashMap;
 use std::convert::Infallible;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
@@ -25,17 +29,19 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 /// or had [`Limits::drain`] to do so.
 pub(super) async fn serve(
     listener: TcpListener,
-    front: Front,
+    front: Arc<Front>,
+    tls: Option<Arc<Tls>>,
     limits: Limits,
     stop: impl Future<Output = ()>,
 ) {
-    let front = Arc::new(front);
     let door = Door {
         builder: builder(&limits),
         front: Arc::clone(&front),
-        places: Places::new(&limits),
+        places: Places::new(&limits, Arc::clone(front.metrics())),
         graceful: GracefulShutdown::new(),
         patience: Patience::from(&limits),
+        tls,
+        handshake: limits.head,
     };
     door.accept(&listener, stop).await;
     front.stop();
@@ -71,6 +77,9 @@ struct Door {
     places: Places,
     graceful: GracefulShutdown,
     patience: Patience,
+    tls: Option<Arc<Tls>>,
+    /// How long it may take until a connection is encrypted.
+    handshake: Duration,
 }
 
 impl Door {
@@ -91,27 +100,60 @@ impl Door {
     }
 
     fn admit(&self, stream: TcpStream, from: SocketAddr) {
-        let Some(place) = self.places.take(from.ip()) else {
-            tracing::debug!(%from, "no place for this connection");
-            return;
+        let place = match self.places.take(subscriber(from.ip())) {
+            Ok(place) => place,
+            Err(reason) => {
+                self.front.metrics().rejected(reason);
+                tracing::debug!(%from, reason, "no place for a connection");
+                return;
+            }
         };
         // Frames of a batch are small, and wait for nothing.
         let _ = stream.set_nodelay(true);
-        let (builder, front) = (Arc::clone(&self.builder), Arc::clone(&self.front));
-        let (watcher, patience) = (self.graceful.watcher(), self.patience);
+        let acceptor = self.tls.as_ref().map(|tls| (tls.acceptor(), self.handshake));
+        let visit = Visit {
+            builder: Arc::clone(&self.builder),
+            front: Arc::clone(&self.front),
+            watcher: self.graceful.watcher(),
+            connection: Arc::new(Connection { activity: Activity::new(), from }),
+            patience: self.patience,
+        };
         tokio::spawn(async move {
             let _place = place;
-            let activity = Activity::new();
-            let io = TokioIo::new(Box::pin(Watched::new(stream, Arc::clone(&activity), patience)));
-            let service = service_fn(move |request| {
-                let (front, activity) = (Arc::clone(&front), Arc::clone(&activity));
-                async move { Ok::<_, Infallible>(front.answer(&activity, request).await) }
-            });
-            let connection = builder.serve_connection(io, service).into_owned();
-            if let Err(error) = watcher.watch(connection).await {
-                tracing::debug!(%error, %from, "connection");
+            let Some((acceptor, patience)) = acceptor else { return visit.serve(stream).await };
+            let noted = Noted::new(stream, Arc::clone(&visit.connection.activity));
+            match tokio::time::timeout(patience, acceptor.accept(noted)).await {
+                Ok(Ok(encrypted)) => visit.serve(encrypted).await,
+                Ok(Err(error)) => tracing::debug!(%error, %from, "handshake"),
+                Err(_) => tracing::debug!(%from, "the handshake took too long"),
             }
         });
+    }
+}
+
+/// A connection that has its place, and all that serves it.
+struct Visit {
+    builder: Arc<auto::Builder<TokioExecutor>>,
+    front: Arc<Front>,
+    watcher: Watcher,
+    connection: Arc<Connection>,
+    patience: Patience,
+}
+
+impl Visit {
+    /// Answers what is asked on a connection, until it ends.
+    async fn serve(self, stream: impl AsyncRead + AsyncWrite + Send + 'static) {
+        let Self { builder, front, watcher, connection, patience } = self;
+        let from = connection.from;
+        let io = TokioIo::new(Box::pin(Watched::new(stream, Arc::clone(&connection.activity), patience)));
+        let service = service_fn(move |request| {
+            let (front, connection) = (Arc::clone(&front), Arc::clone(&connection));
+            async move { Ok::<_, Infallible>(front.answer(&connection, request).await) }
+        });
+        let served = builder.serve_connection(io, service).into_owned();
+        if let Err(error) = watcher.watch(served).await {
+            tracing::debug!(%error, %from, "connection");
+        }
     }
 }
 
@@ -120,6 +162,7 @@ struct Places {
     all: Arc<Semaphore>,
     by_address: Arc<Mutex<HashMap<IpAddr, u32>>>,
     most: u32,
+    metrics: Arc<Metrics>,
 }
 
 /// One of them; free again once dropped.
@@ -127,28 +170,33 @@ struct Place {
     _all: OwnedSemaphorePermit,
     by_address: Arc<Mutex<HashMap<IpAddr, u32>>>,
     address: IpAddr,
+    metrics: Arc<Metrics>,
 }
 
 impl Places {
-    fn new(limits: &Limits) -> Self {
+    fn new(limits: &Limits, metrics: Arc<Metrics>) -> Self {
         let all = Arc::new(Semaphore::new(limits.max_connections as usize));
-        Self { all, by_address: Arc::default(), most: limits.max_connections_per_address }
+        Self { all, by_address: Arc::default(), most: limits.max_connections_per_address, metrics }
     }
 
-    fn take(&self, address: IpAddr) -> Option<Place> {
-        let all = Arc::clone(&self.all).try_acquire_owned().ok()?;
+    /// A place, or which limit leaves none.
+    fn take(&self, address: IpAddr) -> Result<Place, &'static str> {
+        let all = Arc::clone(&self.all).try_acquire_owned().map_err(|_| "connections")?;
         let mut by_address = self.by_address.lock().unwrap_or_else(PoisonError::into_inner);
         let count = by_address.entry(address).or_insert(0);
         if *count >= self.most {
-            return None;
+            return Err("connections_of_address");
         }
         *count += 1;
-        Some(Place { _all: all, by_address: Arc::clone(&self.by_address), address })
+        self.metrics.connections.inc();
+        let (by_address, metrics) = (Arc::clone(&self.by_address), Arc::clone(&self.metrics));
+        Ok(Place { _all: all, by_address, address, metrics })
     }
 }
 
 impl Drop for Place {
     fn drop(&mut self) {
+        self.metrics.connections.dec();
         let mut by_address = self.by_address.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(count) = by_address.get_mut(&self.address) {
             *count -= 1;
