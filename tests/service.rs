@@ -3,7 +3,7 @@
 use crate::hostile::{Ended, end, start};
 use crate::limits::{answer, connect};
 use crate::world::{Served, World, programs, serve_with, serve_within};
-use diamantina_protocol::message::{self, Layer};
+use diamantina_protocol::message;
 use diamantina_server::http::{self, Limits, Options};
 use diamantina_server::inspect;
 use diamantina_server::store::Store;
@@ -297,8 +297,8 @@ fn a_private_scene_is_not_there_but_for_its_token() {
     let version = &world.report.scene.version;
     let stream = format!("/scenes/world/{version}/terrain/stream?error=1");
     let page = format!("/scenes/world/{version}/terrain/index/0");
-    let Layer { origin: [x, y], cell, .. } = world.report.scene.layers[0];
-    let height = format!("/scenes/world/terrain/height?x={}&y={}", x + 64.0 * cell[0], y + 64.0 * cell[1]);
+    let [x, y] = world.report.scene.layers[0].position([64, 64]);
+    let height = format!("/scenes/world/terrain/height?x={x}&y={y}");
     let inside = ["/scenes/world", &routes[0], &batch, &stream, &page, &height];
     let outside = "/scenes/world/0123456789abcdef/terrain/index/0";
     let bearer = format!("Bearer {token}");
@@ -484,4 +484,69 @@ fn settings_come_from_files_variables_and_flags_through_the_real_program() {
     assert_eq!(get(&url).status, 404);
     assert_eq!(ask(Method::GET, &url, &[(AUTHORIZATION, &format!("Bearer {token}"))]).status, 200);
     assert_eq!(server(&["token", "../x"]).code, Some(2));
+}
+
+/// Fills a template of the contract: the parameters of its path by name, those behind the question mark as given.
+fn filled(template: &str, values: &dyn Fn(&str) -> String, query: &str) -> String {
+    let part = |part: &str| match part.strip_prefix('{').and_then(|p| p.strip_suffix('}')) {
+        Some(name) => values(name),
+        None => part.to_owned(),
+    };
+    format!("{}{query}", template.split('/').map(part).collect::<Vec<_>>().join("/"))
+}
+
+#[test]
+fn the_contract_tells_every_answer_that_is_given() {
+    let world = World::sample(129, 0.0);
+    let served = &world.served;
+    let (version, size) = (&world.report.scene.version, world.report.scene.layers[0].forest.size());
+    let answer = get(&format!("{}/openapi.json", served.address));
+    let contract: serde_json::Value = serde_json::from_slice(&answer.body).unwrap();
+    assert_eq!((&contract["openapi"], answer.header("content-type")), (&"3.1.0".into(), "application/json"));
+    let paths = contract["paths"].as_object().unwrap();
+    assert_eq!(paths.len(), 16);
+    let good = |name: &str| match name {
+        "scene" => "world".to_owned(),
+        "version" => version.clone(),
+        "layer" => "terrain".to_owned(),
+        "x" => (size[0] / 2).to_string(),
+        "y" => (size[1] / 2).to_string(),
+        _ => "0".to_owned(),
+    };
+    let old = |name: &str| if name == "version" { "0123456789abcdef".to_owned() } else { good(name) };
+    let none = |name: &str| if name == "scene" { "none".to_owned() } else { good(name) };
+    let odd =
+        |name: &str| if matches!(name, "x" | "page" | "layer") { "..%2f".to_owned() } else { good(name) };
+    let long = format!("?d={}", "1,1;".repeat(500));
+    let [x, y] = world.report.scene.layers[0].position([64, 64]);
+    let place = format!("?x={x}&y={y}");
+    let queries =
+        ["", "?d=1,1;0,0", "?d=x", &long, "?error=1", "?error=-1", &place, "?x=a&y=1", "?lon=0&lat=0"];
+    let mut seen = std::collections::BTreeSet::new();
+    for (template, item) in paths {
+        let responses = item["get"]["responses"].as_object().unwrap();
+        let values: [&dyn Fn(&str) -> String; 4] = [&good, &old, &none, &odd];
+        for (values, query) in values.into_iter().flat_map(|v| queries.map(|q| (v, q))) {
+            let route = filled(template, values, query);
+            for method in [Method::GET, Method::HEAD, Method::DELETE] {
+                let answer = ask(method.clone(), &format!("{}{route}", served.address), &[]);
+                let status = answer.status.as_u16().to_string();
+                let told = &responses.get(&status).unwrap_or_else(|| panic!("{method} {route}: {status}"))["content"];
+                let kind = answer.header("content-type").split(';').next().unwrap();
+                assert!(told.get(kind).is_some(), "{method} {route}: {status} is {kind}, told: {told}");
+                if method == Method::GET && kind == "application/problem+json" {
+                    let problem: serde_json::Value = serde_json::from_slice(&answer.body).unwrap();
+                    assert_eq!(problem["status"].to_string(), status);
+                }
+                seen.insert((template.clone(), status));
+            }
+        }
+    }
+    // Each route was seen to answer (this scene has neither triangles nor a zone), and all kinds of refusals.
+    for template in paths.keys().filter(|t| !t.contains("tin") && !t.contains("zone")) {
+        assert!(seen.contains(&(template.clone(), "200".to_owned())), "{template}: {seen:?}");
+    }
+    for status in ["400", "404", "405", "410", "413"] {
+        assert!(seen.iter().any(|(_, s)| s == status), "{status}: {seen:?}");
+    }
 }

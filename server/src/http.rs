@@ -11,6 +11,7 @@
 //! | `front` | what every request meets before the routes, and every answer after them |
 //! | `access` | who may see which scenes, and how often |
 //! | `routes`, `answer`, `many` | what each kind of address is answered with |
+//! | `contract` | the same, told as OpenAPI |
 //! | `scenes`, `blobs` | what is served: versions that change, and blobs, the hot ones in memory |
 //! | `metrics` | what is counted |
 
@@ -18,6 +19,7 @@ mod accept;
 mod access;
 mod answer;
 mod blobs;
+mod contract;
 mod front;
 mod limits;
 mod many;

@@ -3,6 +3,7 @@
 use super::Site;
 use super::access::Caller;
 use super::answer::{IMMUTABLE, IMMUTABLE_PRIVATE, OCTETS, Refusal, json, tagged};
+use super::contract::{self, About, Form, Holds};
 use super::many::{self, Batch};
 use super::metrics::{Route, metrics};
 use super::scenes::Found;
@@ -23,28 +24,90 @@ use std::sync::Arc;
 
 type Methods = MethodRouter<Arc<Site>>;
 
+/// A route: its template, what is told of it, who answers.
+type Line = (&'static str, About, Methods);
+
+const fn about(summary: &'static str, holds: Holds) -> About {
+    About { summary, holds, query: &[], refusals: &[] }
+}
+
+/// About something of a version, or of a scene.
+const fn below(summary: &'static str, refusals: &'static [u16]) -> About {
+    About { summary, holds: Holds::Octets, query: &[], refusals }
+}
+
+/// About many diamonds at once.
+const BATCH: About = About {
+    query: &[("d", true, Form::Centres)],
+    ..below("Many diamonds, coarse first, in frames", &[400, 404, 410])
+};
+
+const STREAM: About = About {
+    query: &[
+        ("bbox", false, Form::Numbers),
+        ("error", false, Form::Number),
+        ("limit", false, Form::Count),
+        ("eye", false, Form::Numbers),
+        ("angle", false, Form::Number),
+        ("sides", false, Form::Numbers),
+        ("vertical", false, Form::Text),
+    ],
+    ..below("A region or a view, the largest errors first, in frames", &[400, 404, 410])
+};
+
+const HEIGHT: About = About {
+    query: &[
+        ("x", false, Form::Number),
+        ("y", false, Form::Number),
+        ("lon", false, Form::Number),
+        ("lat", false, Form::Number),
+    ],
+    refusals: &[400, 404, 500],
+    ..about("The height at a place, x and y in metres or lon and lat in degrees", Holds::Json)
+};
+
+/// All routes.
+fn lines() -> Vec<Line> {
+    let well = || get(|| async { ([(header::CACHE_CONTROL, "no-store")], "ok\n") });
+    let page = below("A page of the index, zstd-compressed", &[404, 410, 500]);
+    let diamond = below("One diamond, named by its centre", &[404, 410, 500]);
+    vec![
+        ("/", about("What there is, for people", Holds::Html), get(front_page)),
+        ("/health", about("Whether the server answers", Holds::Text), well()),
+        ("/ready", about("Whether it will go on", Holds::Text), well()),
+        ("/metrics", about("What was counted", Holds::Metrics), get(metrics)),
+        ("/scenes", about("All scenes", Holds::Json), get(catalogue)),
+        (
+            "/scenes/{scene}",
+            About { refusals: &[404], ..about("A scene at its newest version", Holds::Json) },
+            get(scene),
+        ),
+        ("/scenes/{scene}/{layer}/height", HEIGHT, get(height_at)),
+        (
+            "/scenes/{scene}/{version}/zones/{zone}",
+            below("What is seen from a zone, zstd-compressed", &[404, 410, 500]),
+            get(zone),
+        ),
+        ("/scenes/{scene}/{version}/{layer}/index/{page}", page, pages(points)),
+        ("/scenes/{scene}/{version}/{layer}/points", BATCH, batches(points)),
+        ("/scenes/{scene}/{version}/{layer}/points/{x}/{y}", diamond, diamonds(points)),
+        ("/scenes/{scene}/{version}/{layer}/tin/index/{page}", page, pages(tin)),
+        ("/scenes/{scene}/{version}/{layer}/tin", BATCH, batches(tin)),
+        ("/scenes/{scene}/{version}/{layer}/tin/{x}/{y}", diamond, diamonds(tin)),
+        ("/scenes/{scene}/{version}/{layer}/stream", STREAM, get(stream)),
+    ]
+}
+
 /// The requests that a site answers.
 pub(super) fn router(site: Arc<Site>) -> Router {
-    let well = || get(|| async { ([(header::CACHE_CONTROL, "no-store")], "ok\n") });
-    let routes: [(&'static str, Methods); 15] = [
-        ("/", get(front_page)),
-        ("/health", well()),
-        ("/ready", well()),
-        ("/metrics", get(metrics)),
-        ("/scenes", get(catalogue)),
-        ("/scenes/{scene}", get(scene)),
-        ("/scenes/{scene}/{layer}/height", get(height_at)),
-        ("/scenes/{scene}/{version}/zones/{zone}", get(zone)),
-        ("/scenes/{scene}/{version}/{layer}/index/{page}", pages(points)),
-        ("/scenes/{scene}/{version}/{layer}/points", batches(points)),
-        ("/scenes/{scene}/{version}/{layer}/points/{x}/{y}", diamonds(points)),
-        ("/scenes/{scene}/{version}/{layer}/tin/index/{page}", pages(tin)),
-        ("/scenes/{scene}/{version}/{layer}/tin", batches(tin)),
-        ("/scenes/{scene}/{version}/{layer}/tin/{x}/{y}", diamonds(tin)),
-        ("/scenes/{scene}/{version}/{layer}/stream", get(stream)),
-    ];
+    let mut lines = lines();
+    let ours = ("/openapi.json", about("This document", Holds::Json));
+    let told = lines.iter().map(|(template, about, _)| (*template, about)).chain([(ours.0, &ours.1)]);
+    let document = Arc::new(contract::document(told));
+    let tell = get(move |headers: HeaderMap| async move { json(&headers, &*document) });
+    lines.push((ours.0, ours.1, tell));
     let mut router = Router::new();
-    for (template, methods) in routes {
+    for (template, _, methods) in lines {
         let named = move |mut response: Response| async move {
             response.extensions_mut().insert(Route(template));
             response
@@ -57,7 +120,7 @@ pub(super) fn router(site: Arc<Site>) -> Router {
         })
         .method_not_allowed_fallback(|| async {
             let refusal = Refusal::new(StatusCode::METHOD_NOT_ALLOWED, "only GET and HEAD are answered");
-            ([(header::ALLOW, "GET, HEAD")], refusal)
+            ([(header::ALLOW, "GET, HEAD, OPTIONS")], refusal)
         })
         .with_state(site)
 }
