@@ -1,7 +1,7 @@
 //! The loop that accepts connections, within limits.
 //!
 //! axum's own loop sets no deadlines and no bounds. Here each connection has a place among all and among those of its
-//! address, and is given up when it stands still or takes too long to ask.
+//! address, and is given up when it stands still or takes too long to ask. It stays with one thread as long as it lasts.
 
 use super::access::subscriber;
 use super::front::{Connection, Front};
@@ -16,11 +16,13 @@ use hyper_util::server::graceful::{GracefulShutdown, Watcher};
 use std::collections::HashMap;
 use std::convert::Infallible;
 use std::net::{IpAddr, SocketAddr};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::runtime::Handle;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
 
 /// The pause after the system refused to accept, for want of files or memory.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
@@ -34,7 +36,12 @@ pub(super) async fn serve(
     limits: Limits,
     stop: impl Future<Output = ()>,
 ) {
+    let crew = match Crew::start() {
+        Ok(crew) => crew,
+        Err(error) => return tracing::error!(%error, "no threads to serve with"),
+    };
     let door = Door {
+        crew,
         builder: builder(&limits),
         front: Arc::clone(&front),
         places: Places::new(&limits, Arc::clone(front.metrics())),
@@ -72,6 +79,7 @@ fn builder(limits: &Limits) -> Arc<auto::Builder<TokioExecutor>> {
 
 /// Where connections come in.
 struct Door {
+    crew: Crew,
     builder: Arc<auto::Builder<TokioExecutor>>,
     front: Arc<Front>,
     places: Places,
@@ -118,8 +126,10 @@ impl Door {
             connection: Arc::new(Connection { activity: Activity::new(), from }),
             patience: self.patience,
         };
-        tokio::spawn(async move {
+        let Ok(stream) = stream.into_std() else { return };
+        self.crew.spawn(async move {
             let _place = place;
+            let Ok(stream) = TcpStream::from_std(stream) else { return };
             let Some((acceptor, patience)) = acceptor else { return visit.serve(stream).await };
             let noted = Noted::new(stream, Arc::clone(&visit.connection.activity));
             match tokio::time::timeout(patience, acceptor.accept(noted)).await {
@@ -128,6 +138,38 @@ impl Door {
                 Err(_) => tracing::debug!(%from, "the handshake took too long"),
             }
         });
+    }
+}
+
+/// Threads that serve connections, each with a runtime of its own: what comes in on a connection wakes one thread, and no
+/// other that might take the work from it.
+struct Crew {
+    members: Vec<(Handle, oneshot::Sender<()>)>,
+    next: AtomicUsize,
+}
+
+impl Crew {
+    fn start() -> std::io::Result<Self> {
+        let count = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+        let member = |number: usize| {
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+            let (handle, (leave, left)) = (runtime.handle().clone(), oneshot::channel::<()>());
+            std::thread::Builder::new().name(format!("serve-{number}")).spawn(move || {
+                // Until the crew is dropped.
+                let _ = runtime.block_on(left);
+                // Whoever still waits for the disk is not waited for.
+                runtime.shutdown_background();
+            })?;
+            Ok((handle, leave))
+        };
+        let members = (0..count).map(member).collect::<std::io::Result<_>>()?;
+        Ok(Self { members, next: AtomicUsize::new(0) })
+    }
+
+    /// Leaves a connection to the next member.
+    fn spawn(&self, visit: impl Future<Output = ()> + Send + 'static) {
+        let number = self.next.fetch_add(1, Ordering::Relaxed) % self.members.len();
+        self.members[number].0.spawn(visit);
     }
 }
 

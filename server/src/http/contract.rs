@@ -34,6 +34,8 @@ pub(super) struct About {
 pub(super) enum Form {
     /// A whole number from 0.
     Count,
+    /// Bytes, from 1.
+    Bytes,
     /// A number.
     Number,
     /// Letters, digits, '-', '_' and '.'.
@@ -57,6 +59,7 @@ impl Form {
                 .schema_type(Type::Integer)
                 .minimum(Some(0))
                 .maximum(Some(u32::MAX as usize)),
+            Self::Bytes => ObjectBuilder::new().schema_type(Type::Integer).minimum(Some(1)),
             Self::Number => ObjectBuilder::new().schema_type(Type::Number),
             Self::Name => text(Some("^[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}$")),
             Self::Centres => text(Some("^[0-9]{1,9},[0-9]{1,9}(;[0-9]{1,9},[0-9]{1,9}){0,100}$")),

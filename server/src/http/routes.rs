@@ -46,7 +46,7 @@ const STREAM: About = About {
     query: &[
         ("bbox", false, Form::Numbers),
         ("error", false, Form::Number),
-        ("limit", false, Form::Count),
+        ("limit", false, Form::Bytes),
         ("eye", false, Form::Numbers),
         ("angle", false, Form::Number),
         ("sides", false, Form::Numbers),
