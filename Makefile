@@ -2,7 +2,7 @@
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .NOTPARALLEL:
-.PHONY: help demo test check bench bench-link bench-peers bench-wasm setup fmt clippy tests doc deny wasm scripts
+.PHONY: help demo test check contract bench bench-link bench-peers bench-serve bench-wasm setup fmt clippy tests doc deny wasm scripts
 
 # Mesa's device selection complains where there is no desktop session; there is nothing to select.
 export NODEVICE_SELECT := 1
@@ -16,6 +16,7 @@ help:
 	@echo "make check   formatting and lints only"
 	@echo "make bench   benchmarks, with a table at the end"
 	@echo "make bench-link    seconds to a view over slow links, on the DEMs of DIAMANTINA_DATA"
+	@echo "make bench-serve   requests a second beside nginx, where it and wrk are installed"
 	@echo "make bench-wasm    decoding in the browser's architecture, where it and node are installed"
 	@echo "make bench-peers   bytes, bounds and speed beside other codecs, on the DEMs of DIAMANTINA_DATA"
 
@@ -24,7 +25,7 @@ demo:
 	@$(step) build cargo build --locked --release -p diamantina-server -p diamantina-client
 	$(target)/release/diamantina-server demo
 
-test: setup fmt clippy tests doc deny wasm scripts
+test: setup fmt clippy tests contract doc deny wasm scripts
 
 check: fmt clippy
 
@@ -36,6 +37,10 @@ bench:
 bench-link:
 	@$(step) setup scripts/setup demo
 	@$(step) link scripts/bench-link
+
+bench-serve:
+	@$(step) setup scripts/setup demo
+	@$(step) serve scripts/bench-serve
 
 bench-wasm:
 	@$(step) wasm scripts/bench-wasm
@@ -59,6 +64,10 @@ clippy:
 tests:
 	@$(step) tests cargo test --locked --workspace --no-fail-fast -- --show-output
 
+# After the tests, which have built the programs.
+contract:
+	@$(step) contract scripts/contract
+
 doc:
 	@RUSTDOCFLAGS="-D warnings" $(step) doc cargo doc --locked --workspace --no-deps
 
@@ -69,4 +78,4 @@ wasm:
 	@$(step) wasm scripts/wasm
 
 scripts:
-	@$(step) scripts shellcheck .ci/run scripts/bench scripts/bench-link scripts/bench-peers scripts/bench-wasm scripts/deny scripts/setup scripts/step scripts/wasm scripts/wasm-cargo
+	@$(step) scripts shellcheck .ci/run scripts/bench scripts/bench-link scripts/bench-peers scripts/bench-serve scripts/bench-wasm scripts/contract scripts/deny scripts/setup scripts/step scripts/wasm scripts/wasm-cargo

@@ -29,6 +29,8 @@ mod progressive;
 mod resume;
 /// Law 2: any cut of a built store, with anything missing, has no cracks.
 mod seams;
+/// What an operator relies on: headers, counters, logs, encryption, tokens, rates, settings.
+mod service;
 /// Streaming from end to end: pictures, bytes, flights with late data.
 mod stream;
 /// A scene built again while it is served: nobody is refused, and a bad version never replaces a good one.

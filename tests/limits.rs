@@ -102,6 +102,23 @@ fn who_is_slow_to_ask_or_silent_is_cut_off() {
 }
 
 #[test]
+fn who_waits_before_asking_again_has_longer_than_a_head() {
+    let world = World::sample(129, 0.0);
+    let limits = Limits { head: milliseconds(300), still: milliseconds(5000), ..Limits::default() };
+    let served = serve_within(&[world.folder.path().join("store")], limits);
+    let mut stream = connect(&served.address);
+    for _ in 0..3 {
+        request(&mut stream, "/health");
+        assert!(answer(&mut stream).contains("200 OK"));
+        sleep(milliseconds(700));
+    }
+    // The next head has its own deadline all the same.
+    let started = Instant::now();
+    stream.write_all(b"GET /hea").unwrap();
+    assert!(is_closed(&mut stream) && started.elapsed() < milliseconds(3000), "{:?}", started.elapsed());
+}
+
+#[test]
 fn an_address_has_so_many_connections_and_no_more() {
     let world = World::sample(129, 0.0);
     let limits = Limits { max_connections_per_address: 2, ..Limits::default() };

@@ -2,6 +2,9 @@
 
 use crate::limits::{answer, connect, request};
 use crate::world::{Served, build, options, serve_within};
+use diamantina_client::headless;
+use diamantina_client::terrain::{FrameView, Options, Terrain};
+use diamantina_protocol::diamond::Diamond;
 use diamantina_server::http::Limits;
 use diamantina_server::{hierarchy, ingest, sample};
 use std::path::Path;
@@ -93,4 +96,57 @@ fn a_scene_built_again_is_swapped_and_a_damaged_one_is_not() {
     let fourth = made(&folder.path().join("fourth"), 3.0);
     publish(&folder.path().join("fourth"), &store, &fourth.version, false);
     wait("a sound version after a damaged one is never served", || version(&served) == fourth.version);
+}
+
+/// What a view draws, and how high.
+fn drawn(view: &FrameView) -> Vec<(Diamond, u8, Vec<i32>)> {
+    let mut items: Vec<_> = view
+        .items
+        .iter()
+        .map(|item| {
+            let heights = item.surface.points().unwrap().block().heights().to_vec();
+            (item.diamond, item.sides, heights)
+        })
+        .collect();
+    items.sort_by_key(|(d, sides, _)| (d.level(), d.centre(), *sides));
+    items
+}
+
+#[test]
+fn a_flight_across_a_swap_goes_on_and_ends_in_the_new_version() {
+    let folder = tempfile::tempdir().unwrap();
+    let (dem, store) = (folder.path().join("dem.tif"), folder.path().join("store"));
+    sample::write(&dem, 257).unwrap();
+    let made = |max_error: f64| {
+        let options = hierarchy::Options { max_error, ..options() };
+        build(&dem, &store, &ingest::Options::default(), &options).scene
+    };
+    let first = made(4.0);
+    let limits = Limits { reload: 1, grace: 0, ..Limits::default() };
+    let served = serve_within(std::slice::from_ref(&store), limits);
+    let url = format!("{}/scenes/world", served.address);
+    let open =
+        |tolerance_pixels| Terrain::open(&url, Options { tolerance_pixels, ..Options::default() }).unwrap();
+    let mut terrain = open(30.0);
+    let camera = headless::overview(terrain.scene(), [640, 480]);
+    assert!(terrain.settle(&camera, PATIENCE).complete);
+    let second = made(0.0);
+    wait("the first version does not go", || {
+        ask(&served, &format!("/scenes/world/{}/terrain/index/0", first.version)).starts_with("HTTP/1.1 410")
+    });
+    // Closer looked at, more is needed, and there is none of it.
+    terrain.set_tolerance_pixels(0.5);
+    let started = Instant::now();
+    while terrain.scene().version != second.version {
+        let view = terrain.frame(&camera);
+        assert!(!view.items.is_empty() && view.error_pixels.is_finite(), "there is always a picture");
+        assert!(started.elapsed() < PATIENCE, "the new version never takes over: {:?}", terrain.problem());
+        sleep(Duration::from_millis(5));
+    }
+    let view = terrain.settle(&camera, PATIENCE);
+    assert!(view.complete && view.error_pixels <= 0.5 && view.stats.reloads == 1, "{view:?}");
+    assert!(!terrain.scene_changed());
+    let fresh = open(0.5).settle(&camera, PATIENCE);
+    assert!(drawn(&view) == drawn(&fresh), "what is drawn is what a new client draws");
+    assert!(view.stats.traffic.bytes > fresh.stats.traffic.bytes, "both versions are counted");
 }

@@ -2,7 +2,7 @@
 
 use diamantina_client::terrain::{self, Terrain};
 use diamantina_server::hierarchy::{self, Report};
-use diamantina_server::http::{Limits, Server};
+use diamantina_server::http::{self, Limits, Server};
 use diamantina_server::progress::Progress;
 use diamantina_server::{ingest, sample};
 use std::io::{Read, Write};
@@ -145,7 +145,12 @@ pub(crate) fn serve(stores: &[PathBuf]) -> Served {
 
 /// Serves stores on a free port, within limits.
 pub(crate) fn serve_within(stores: &[PathBuf], limits: Limits) -> Served {
-    let server = Server::open(stores, "127.0.0.1:0".parse().unwrap()).unwrap().within(limits);
+    serve_with(stores, &http::Options { limits, ..http::Options::default() })
+}
+
+/// Serves stores on a free port, as told.
+pub(crate) fn serve_with(stores: &[PathBuf], options: &http::Options) -> Served {
+    let server = Server::open_with(stores, "127.0.0.1:0".parse().unwrap(), options).unwrap();
     let address = server.address();
     let (stop, stopped) = tokio::sync::oneshot::channel();
     std::thread::spawn(move || {

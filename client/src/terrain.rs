@@ -11,8 +11,11 @@
 //! A frame never waits: not for the network, not for a decoder. A payload can be decoded once its parents'
 //! surfaces are there; the decoding threads hold it till then and go on from parent to child by
 //! themselves, so a whole branch that arrived in one answer is decoded between two frames.
+//!
+//! A scene that is replaced on the server while it is looked at is opened again by itself: see `reload`.
 
 mod decoders;
+mod reload;
 
 use crate::cache::{Cache, Index, Key, PAGES_MAX};
 use crate::camera::{Camera, Plane};
@@ -30,6 +33,7 @@ use diamantina_protocol::message::{Layer, Scene, StreamAsk, StreamView};
 use diamantina_protocol::zone::{Mask, Zone};
 use foldhash::fast::RandomState;
 use glam::DVec3;
+use reload::Reload;
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -172,6 +176,8 @@ pub struct Stats {
     pub asked_error_seconds: Option<f64>,
     /// Seconds that the last frame took.
     pub frame_seconds: f64,
+    /// Times that another version of the scene took over.
+    pub reloads: u32,
 }
 
 /// What a frame shows.
@@ -200,6 +206,8 @@ pub struct FrameView {
 /// for what is on its way, besides the index.
 #[derive(Debug)]
 pub struct Terrain {
+    /// Of the scene itself, also where it was opened as a server's only one.
+    url: String,
     scene: Arc<Scene>,
     options: Options,
     layers: Vec<LayerState>,
@@ -214,6 +222,12 @@ pub struct Terrain {
     failed: HashSet<fetch::Key, RandomState>,
     problem: Option<String>,
     scene_changed: bool,
+    /// The version that takes over, once this one has been replaced.
+    reload: Option<Reload>,
+    /// The declared error of the last frame.
+    error_pixels: f64,
+    /// What went over the wire for the versions before.
+    traffic_before: Traffic,
     opened: Instant,
     /// What the last frame saw; nothing before the first.
     planes: Option<[Plane; 5]>,
@@ -298,6 +312,7 @@ impl Terrain {
         let cache = Cache::new(forests, options.memory_bytes);
         let scene = Arc::new(scene);
         Ok(Self {
+            url: fetcher.address(),
             layers,
             cache,
             fetcher,
@@ -310,6 +325,9 @@ impl Terrain {
             failed: HashSet::default(),
             problem: None,
             scene_changed: false,
+            reload: None,
+            error_pixels: f64::INFINITY,
+            traffic_before: Traffic::default(),
             opened,
             planes: None,
             stats: Stats::default(),
@@ -323,8 +341,8 @@ impl Terrain {
         &self.scene
     }
 
-    /// Whether the server has another version of the scene: what is here stays, and nothing more comes.
-    /// Open it again.
+    /// Whether the server has another version of the scene: what is here stays, and nothing more of it comes. The other
+    /// one is being loaded, and takes over with one of the next frames: then [`Terrain::scene`] is that one.
     #[must_use]
     pub fn scene_changed(&self) -> bool {
         self.scene_changed
@@ -408,11 +426,22 @@ impl Terrain {
     /// As [`Terrain::frame`], at a moment of the caller's clock, which runs forward: seconds from any beginning, the same
     /// for all frames. Only motions depend on it.
     pub fn frame_at(&mut self, camera: &Camera, seconds: f64) -> FrameView {
+        if self.scene_changed
+            && let Some(view) = self.go_over(camera, seconds)
+        {
+            return view;
+        }
+        self.draw_at(camera, seconds)
+    }
+
+    /// A frame of this version.
+    fn draw_at(&mut self, camera: &Camera, seconds: f64) -> FrameView {
         let now = Moment::at(seconds);
         let started = Instant::now();
         self.take_decoded();
         let arrived = self.take_fetched();
-        let mut view = FrameView { complete: true, ..FrameView::default() };
+        // What comes of another version is still to come.
+        let mut view = FrameView { complete: !self.scene_changed, ..FrameView::default() };
         let mut wishes = Vec::new();
         (self.stats.splits_ideal, self.stats.splits_drawn) = (0, 0);
         // Heights that are multiplied, all of them, leave hidden what is hidden.
@@ -474,13 +503,21 @@ impl Terrain {
                 Some(seconds) => self.frame_at(camera, seconds),
                 None => self.frame(camera),
             };
-            let stuck = self.decoders.is_idle() && self.fetcher.is_stuck();
+            let stuck = match &self.reload {
+                Some(reload) => reload.is_stuck(),
+                None => !self.scene_changed && self.is_stuck(),
+            };
             let still = view.moving == 0 || seconds.is_some();
-            if (still && (view.complete || stuck)) || self.scene_changed || Instant::now() >= until {
+            if (still && (view.complete || stuck)) || Instant::now() >= until {
                 return view;
             }
             std::thread::sleep(Duration::from_millis(2));
         }
+    }
+
+    /// Whether nothing more comes for now.
+    fn is_stuck(&self) -> bool {
+        self.decoders.is_idle() && self.fetcher.is_stuck()
     }
 
     fn take_decoded(&mut self) {
@@ -601,6 +638,10 @@ impl Terrain {
         wants.push(Want { key: fetch::Key::Diamond(number, wish.diamond), bytes: wish.bytes });
     }
 
+    fn note_traffic(&mut self) {
+        self.stats.traffic = self.traffic_before.plus(&self.fetcher.traffic());
+    }
+
     fn note(&mut self, view: &FrameView, started: Instant) {
         let since = self.opened.elapsed().as_secs_f64();
         if !view.items.is_empty() {
@@ -609,7 +650,8 @@ impl Terrain {
                 self.stats.asked_error_seconds.get_or_insert(since);
             }
         }
-        self.stats.traffic = self.fetcher.traffic();
+        self.error_pixels = view.error_pixels;
+        self.note_traffic();
         self.stats.resident = self.cache.len();
         self.stats.resident_bytes = self.cache.bytes();
         self.stats.pages = self.layers.iter().map(|state| state.index.pages()).sum();

@@ -15,6 +15,8 @@ pub mod measure;
 pub mod progress;
 pub mod projection;
 pub mod sample;
+pub mod settings;
+pub mod size;
 pub mod store;
 pub mod stream;
 pub mod tin;

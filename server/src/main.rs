@@ -1,6 +1,6 @@
 //! The command line of the server.
 
-use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
+use clap::{ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use diamantina_protocol::message::{Kind, Layer, is_name};
 use diamantina_protocol::points::Rule;
 use diamantina_server::experiment::ExperimentError;
@@ -8,6 +8,8 @@ use diamantina_server::hierarchy::{self, BuildError, Estimate, Report, TinOption
 use diamantina_server::ingest::IngestError;
 use diamantina_server::inspect::{self, Inspection, TinInspection};
 use diamantina_server::progress::Progress;
+use diamantina_server::settings::{self, LogFormat, Merged, Settings};
+use diamantina_server::size::parse_bytes;
 use diamantina_server::store::{Store, StoreError};
 use diamantina_server::tin::Metric;
 use diamantina_server::zone::polygon::Coordinates;
@@ -34,7 +36,12 @@ enum Command {
     /// Turn DEM files into a store of diamonds
     Build(Box<BuildArgs>),
     /// Offer stores over HTTP
-    Serve(ServeArgs),
+    Serve(Box<ServeArgs>),
+    /// Look at what `serve` is told by a file, the environment and flags
+    #[command(subcommand)]
+    Config(ConfigCommand),
+    /// Make a token for a private scene, and the line for the file of `serve --tokens`
+    Token(TokenArgs),
     /// Say what a store holds
     Inspect(InspectArgs),
     /// Compute what is seen from a region where the viewer stays, and add it to a store
@@ -133,14 +140,26 @@ enum RuleName {
 
 #[derive(Args)]
 struct ServeArgs {
-    /// Folders of stores
-    #[arg(required = true, value_name = "STORE")]
-    stores: Vec<PathBuf>,
-    /// The address to listen on; port 0 picks a free one
-    #[arg(long, default_value = "127.0.0.1:8080", value_name = "ADDRESS:PORT")]
-    listen: SocketAddr,
+    /// Settings as TOML, `max_connections = 10` for --max-connections 10; flags win, then variables such as
+    /// DIAMANTINA_MAX_CONNECTIONS [also: DIAMANTINA_CONFIG]
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
     #[command(flatten)]
-    limits: http::Limits,
+    settings: Settings,
+}
+
+#[derive(Subcommand)]
+enum ConfigCommand {
+    /// Try all that `serve` would do with a file of settings, but for listening
+    Check(Box<ServeArgs>),
+    /// Print all settings as a file, and where each is from
+    Print(Box<ServeArgs>),
+}
+
+#[derive(Args)]
+struct TokenArgs {
+    /// The scene's name
+    scene: String,
 }
 
 #[derive(Args)]
@@ -256,25 +275,6 @@ struct HealthArgs {
     address: SocketAddr,
 }
 
-/// Bytes with an optional unit: 512MiB, 2GiB, 1500000000.
-fn parse_bytes(text: &str) -> Result<u64, String> {
-    let digits = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
-    let (number, unit) = text.split_at(digits);
-    let scale = match unit.trim() {
-        "" | "B" => 1u64,
-        "KiB" | "K" => 1 << 10,
-        "MiB" | "M" => 1 << 20,
-        "GiB" | "G" => 1 << 30,
-        "kB" => 1000,
-        "MB" => 1_000_000,
-        "GB" => 1_000_000_000,
-        _ => return Err(format!("unit '{unit}': expected KiB, MiB, GiB, kB, MB or GB, as in 2GiB")),
-    };
-    let value: u64 =
-        number.parse().map_err(|_| "expected a whole number with a unit, as in 2GiB".to_owned())?;
-    value.checked_mul(scale).ok_or_else(|| "more than 16 EiB".to_owned())
-}
-
 /// The exit code of a build that was asked to stop.
 const INTERRUPTED: u8 = 130;
 
@@ -298,18 +298,35 @@ fn shown(printed: std::io::Result<()>) -> std::io::Result<()> {
     }
 }
 
-fn main() -> ExitCode {
+/// Writes the log on standard error; `RUST_LOG` says how much of it.
+fn start_log(format: LogFormat) {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| "warn".into());
     let colours =
         std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty());
-    let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours);
-    log.with_writer(std::io::stderr).init();
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    match format {
+        LogFormat::Text => log.with_ansi(colours).init(),
+        LogFormat::Json => log.json().flatten_event(true).init(),
+    }
+}
+
+fn main() -> ExitCode {
     let matches = Cli::command().get_matches();
     let cli = Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit());
-    let given = matches.subcommand().map_or(&matches, |(_, given)| given);
+    if !matches!(cli.command, Command::Serve(_)) {
+        start_log(LogFormat::Text);
+    }
+    // The arguments of the innermost command: which of them were given is seen there.
+    let mut given = &matches;
+    while let Some((_, inner)) = given.subcommand() {
+        given = inner;
+    }
     let result = match cli.command {
         Command::Build(args) => build(*args),
-        Command::Serve(args) => serve(&args),
+        Command::Serve(args) => serve(given, args.config),
+        Command::Config(ConfigCommand::Check(args)) => check_config(given, args.config),
+        Command::Config(ConfigCommand::Print(args)) => print_config(given, args.config),
+        Command::Token(args) => make_token(&args.scene),
         Command::Inspect(args) => inspect_store(&args),
         Command::Zone(args) => compute_zone(*args),
         Command::Demo(args) => demonstrate(&args),
@@ -545,13 +562,67 @@ fn print_report(out: &mut impl Write, store: &Path, report: &Report) -> std::io:
     writeln!(out, "Next: diamantina-server serve {}", store.display())
 }
 
-fn serve(args: &ServeArgs) -> Result<(), Failure> {
-    let server = http::Server::open(&args.stores, args.listen)?.within(args.limits);
+/// What holds for `serve`, of the arguments given, the environment and a file.
+fn settings(given: &ArgMatches, config: Option<PathBuf>) -> Result<Merged, Failure> {
+    let variables: Vec<_> =
+        std::env::vars_os().filter_map(|(name, value)| Some((name.into_string().ok()?, value))).collect();
+    let named = || std::env::var_os("DIAMANTINA_CONFIG").filter(|path| !path.is_empty()).map(PathBuf::from);
+    let merged = settings::merge(given, config.or_else(named).as_deref(), &variables);
+    merged.map_err(|e| Failure(2, e.to_string()))
+}
+
+/// The stores and options of settings, if they are complete.
+fn serving(settings: &Settings) -> Result<http::Options, Failure> {
+    if settings.stores.is_empty() {
+        let words =
+            "no store to serve: name folders of stores, or say stores = [\"STORE\"] in a --config file";
+        return Err(Failure(2, words.to_owned()));
+    }
+    let certificate = settings.certificate().map_err(|e| Failure(2, e.to_string()))?;
+    Ok(http::Options { limits: settings.limits, tokens: settings.tokens.clone(), certificate })
+}
+
+fn serve(given: &ArgMatches, config: Option<PathBuf>) -> Result<(), Failure> {
+    let Merged { settings, notices, .. } = settings(given, config)?;
+    start_log(settings.log_format);
+    for notice in notices {
+        tracing::warn!("{notice}");
+    }
+    let server = http::Server::open_with(&settings.stores, settings.listen, &serving(&settings)?)?;
     let mut out = std::io::stdout().lock();
     let printed = writeln!(out, "Serving {} at {}", server.scenes().join(", "), server.address());
     shown(printed.and_then(|()| out.flush()))?;
     drop(out);
     Ok(server.run_until_signal()?)
+}
+
+fn check_config(given: &ArgMatches, config: Option<PathBuf>) -> Result<(), Failure> {
+    let Merged { settings, notices, .. } = settings(given, config)?;
+    let scenes = http::check(&settings.stores, &serving(&settings)?)?;
+    let mut out = std::io::stdout().lock();
+    for notice in notices {
+        shown(writeln!(out, "notice: {notice}"))?;
+    }
+    Ok(shown(writeln!(out, "These settings are well: {} would be served", scenes.join(", ")))?)
+}
+
+fn print_config(given: &ArgMatches, config: Option<PathBuf>) -> Result<(), Failure> {
+    let merged = settings(given, config)?;
+    Ok(shown(write!(std::io::stdout().lock(), "{}", merged.to_toml()))?)
+}
+
+fn make_token(scene: &str) -> Result<(), Failure> {
+    if !is_name(scene) {
+        return Err(Failure(2, format!("'{scene}' is no name of a scene")));
+    }
+    let (token, hash) = http::new_token()?;
+    let mut out = std::io::stdout().lock();
+    shown(writeln!(
+        out,
+        "For who may see '{scene}', as `Authorization: Bearer TOKEN`; it is shown only now:\n  {token}\n\
+         For the file of `serve --tokens`:\n  {scene} {hash}"
+    ))?;
+    Ok(())
 }
 
 fn inspect_store(args: &InspectArgs) -> Result<(), Failure> {

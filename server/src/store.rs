@@ -727,6 +727,12 @@ impl Store {
         &self.scene
     }
 
+    /// Whether there is a blob of a key.
+    #[must_use]
+    pub fn has(&self, key: Key) -> bool {
+        self.places.contains_key(&key)
+    }
+
     /// The blob of a key, checked; `None` if there is none.
     ///
     /// # Errors

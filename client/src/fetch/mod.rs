@@ -36,7 +36,7 @@ use crate::encoding::Encoding;
 use bytes::Bytes;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::Entry;
-use diamantina_protocol::message::{Scene, StreamAsk};
+use diamantina_protocol::message::{Scene, StreamAsk, scene_route};
 use diamantina_protocol::zone::Mask;
 use foldhash::fast::RandomState;
 use http::{Counters, Http, parse_address};
@@ -126,6 +126,20 @@ pub struct Traffic {
     pub cancelled: u64,
 }
 
+impl Traffic {
+    /// Both together.
+    #[must_use]
+    pub fn plus(&self, other: &Self) -> Self {
+        Self {
+            bytes: self.bytes + other.bytes,
+            requests: self.requests + other.requests,
+            round_trips: self.round_trips + other.round_trips,
+            errors: self.errors + other.errors,
+            cancelled: self.cancelled + other.cancelled,
+        }
+    }
+}
+
 /// Fetches a scene. Dropping it drops its requests, without waiting.
 ///
 /// Holds the wishes and, for each request in flight, at most one payload or page beyond what is handed out.
@@ -201,6 +215,13 @@ impl Fetcher {
             runtime.spawn(work(Arc::clone(&shared)));
         }
         Ok((Self { shared, events, seen: 0, runtime: Some(runtime) }, scene))
+    }
+
+    /// The scene's address.
+    #[must_use]
+    pub fn address(&self) -> String {
+        let Shared { http, scene, .. } = &*self.shared;
+        format!("{}{}", http.base, scene_route(&scene.name))
     }
 
     /// The masks of one of the scene's zones, one a layer, of the diamonds of its points; waits for them.

@@ -1,71 +1,57 @@
 //! The loop that accepts connections, within limits.
 //!
 //! axum's own loop sets no deadlines and no bounds. Here each connection has a place among all and among those of its
-//! address, a deadline for the head of a request, and is given up when it stands still. Each answer has a place, which it
-//! holds until its last byte is gone, and a deadline for all of it.
+//! address, and is given up when it stands still or takes too long to ask. It stays with one thread as long as it lasts.
 
-use super::limits::{HEAD_BYTES_MAX, Limits, RETRY_AFTER, STREAMS_MAX, URI_BYTES_MAX};
-use super::still::Watched;
-use super::{Refusal, common_headers};
-use axum::Router;
-use axum::body::{Body, Bytes};
-use axum::extract::{Request, State};
-use axum::http::{HeaderValue, StatusCode, header};
-use axum::middleware::{self, Next};
-use axum::response::{IntoResponse, Response};
-use http_body::{Body as _, Frame, SizeHint};
+use super::access::subscriber;
+use super::front::{Connection, Front};
+use super::limits::{HEAD_BYTES_MAX, Limits, STREAMS_MAX, URI_BYTES_MAX};
+use super::metrics::Metrics;
+use super::still::{Activity, Noted, Patience, Watched};
+use super::tls::Tls;
+use hyper::service::service_fn;
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto;
-use hyper_util::server::graceful::GracefulShutdown;
-use hyper_util::service::TowerToHyperService;
+use hyper_util::server::graceful::{GracefulShutdown, Watcher};
 use std::collections::HashMap;
+use std::convert::Infallible;
 use std::net::{IpAddr, SocketAddr};
-use std::pin::Pin;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::task::{Context, Poll};
 use std::time::Duration;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
-use tokio::time::Instant;
+use tokio::runtime::Handle;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
 
 /// The pause after the system refused to accept, for want of files or memory.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 
-/// Answers under way, and whether more are wanted.
-#[derive(Clone)]
-struct Gate {
-    places: Arc<Semaphore>,
-    stopping: Arc<AtomicBool>,
-    answer: Duration,
-}
-
-/// Serves `router` on connections of `listener` until `stop` is done and the answers under way have ended, or had
-/// [`Limits::drain`] to do so.
+/// Serves what is behind `front` on connections of `listener` until `stop` is done and the answers under way have ended,
+/// or had [`Limits::drain`] to do so.
 pub(super) async fn serve(
     listener: TcpListener,
-    router: Router,
+    front: Arc<Front>,
+    tls: Option<Arc<Tls>>,
     limits: Limits,
     stop: impl Future<Output = ()>,
 ) {
-    let gate = Gate {
-        places: Arc::new(Semaphore::new(limits.max_in_flight as usize)),
-        stopping: Arc::default(),
-        answer: limits.answer,
+    let crew = match Crew::start() {
+        Ok(crew) => crew,
+        Err(error) => return tracing::error!(%error, "no threads to serve with"),
     };
-    let stopping = Arc::clone(&gate.stopping);
-    // Refusals have the headers of all answers.
-    let router =
-        router.layer(middleware::from_fn_with_state(gate, pass)).layer(middleware::from_fn(common_headers));
     let door = Door {
+        crew,
         builder: builder(&limits),
-        service: TowerToHyperService::new(router),
-        places: Places::new(&limits),
+        front: Arc::clone(&front),
+        places: Places::new(&limits, Arc::clone(front.metrics())),
         graceful: GracefulShutdown::new(),
-        still: limits.still,
+        patience: Patience::from(&limits),
+        tls,
+        handshake: limits.head,
     };
     door.accept(&listener, stop).await;
-    stopping.store(true, Ordering::Relaxed);
+    front.stop();
     door.accept(&listener, tokio::time::sleep(Duration::from_secs(limits.shutdown_notice.into()))).await;
     drop(listener);
     if tokio::time::timeout(limits.drain, door.graceful.shutdown()).await.is_err() {
@@ -75,10 +61,11 @@ pub(super) async fn serve(
 
 fn builder(limits: &Limits) -> Arc<auto::Builder<TokioExecutor>> {
     let mut builder = auto::Builder::new(TokioExecutor::new());
+    // Heads have their deadline from `Watched`: hyper's timer would begin with the answer before.
     builder
         .http1()
         .timer(TokioTimer::new())
-        .header_read_timeout(limits.head)
+        .header_read_timeout(None)
         .max_buf_size(HEAD_BYTES_MAX.max(URI_BYTES_MAX));
     builder
         .http2()
@@ -92,11 +79,15 @@ fn builder(limits: &Limits) -> Arc<auto::Builder<TokioExecutor>> {
 
 /// Where connections come in.
 struct Door {
+    crew: Crew,
     builder: Arc<auto::Builder<TokioExecutor>>,
-    service: TowerToHyperService<Router>,
+    front: Arc<Front>,
     places: Places,
     graceful: GracefulShutdown,
-    still: Duration,
+    patience: Patience,
+    tls: Option<Arc<Tls>>,
+    /// How long it may take until a connection is encrypted.
+    handshake: Duration,
 }
 
 impl Door {
@@ -117,76 +108,94 @@ impl Door {
     }
 
     fn admit(&self, stream: TcpStream, from: SocketAddr) {
-        let Some(place) = self.places.take(from.ip()) else {
-            tracing::debug!(%from, "no place for this connection");
-            return;
+        let place = match self.places.take(subscriber(from.ip())) {
+            Ok(place) => place,
+            Err(reason) => {
+                self.front.metrics().rejected(reason);
+                tracing::debug!(%from, reason, "no place for a connection");
+                return;
+            }
         };
         // Frames of a batch are small, and wait for nothing.
         let _ = stream.set_nodelay(true);
-        let (builder, service) = (Arc::clone(&self.builder), self.service.clone());
-        let (watcher, still) = (self.graceful.watcher(), self.still);
-        tokio::spawn(async move {
+        let acceptor = self.tls.as_ref().map(|tls| (tls.acceptor(), self.handshake));
+        let visit = Visit {
+            builder: Arc::clone(&self.builder),
+            front: Arc::clone(&self.front),
+            watcher: self.graceful.watcher(),
+            connection: Arc::new(Connection { activity: Activity::new(), from }),
+            patience: self.patience,
+        };
+        let Ok(stream) = stream.into_std() else { return };
+        self.crew.spawn(async move {
             let _place = place;
-            let io = TokioIo::new(Box::pin(Watched::new(stream, still)));
-            let connection = builder.serve_connection(io, service).into_owned();
-            if let Err(error) = watcher.watch(connection).await {
-                tracing::debug!(%error, %from, "connection");
+            let Ok(stream) = TcpStream::from_std(stream) else { return };
+            let Some((acceptor, patience)) = acceptor else { return visit.serve(stream).await };
+            let noted = Noted::new(stream, Arc::clone(&visit.connection.activity));
+            match tokio::time::timeout(patience, acceptor.accept(noted)).await {
+                Ok(Ok(encrypted)) => visit.serve(encrypted).await,
+                Ok(Err(error)) => tracing::debug!(%error, %from, "handshake"),
+                Err(_) => tracing::debug!(%from, "the handshake took too long"),
             }
         });
     }
 }
 
-/// Lets a request through if it is one that this server answers and there is room for its answer.
-async fn pass(State(gate): State<Gate>, request: Request, next: Next) -> Response {
-    if gate.stopping.load(Ordering::Relaxed) && request.uri().path() == "/ready" {
-        return Refusal::new(StatusCode::SERVICE_UNAVAILABLE, "this server is about to stop").into_response();
-    }
-    if request.uri().to_string().len() > URI_BYTES_MAX {
-        let detail = format!("an address has at most {URI_BYTES_MAX} bytes: ask for fewer diamonds at once");
-        return Refusal::new(StatusCode::URI_TOO_LONG, detail).into_response();
-    }
-    if !request.body().is_end_stream() {
-        let refusal = Refusal::new(StatusCode::PAYLOAD_TOO_LARGE, "no request here has a body");
-        // What follows is not read.
-        return ([(header::CONNECTION, "close")], refusal).into_response();
-    }
-    let Ok(place) = Arc::clone(&gate.places).try_acquire_owned() else {
-        let refusal = Refusal::new(StatusCode::SERVICE_UNAVAILABLE, "too much to do: ask again in a moment");
-        let mut response = refusal.into_response();
-        response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from_static(RETRY_AFTER));
-        return response;
-    };
-    let due = Instant::now() + gate.answer;
-    next.run(request).await.map(|body| Body::new(Held { body, due, _place: place }))
+/// Threads that serve connections, each with a runtime of its own: what comes in on a connection wakes one thread, and no
+/// other that might take the work from it.
+struct Crew {
+    members: Vec<(Handle, oneshot::Sender<()>)>,
+    next: AtomicUsize,
 }
 
-/// The body of an answer, which holds its place until it is gone.
-struct Held {
-    body: Body,
-    due: Instant,
-    _place: OwnedSemaphorePermit,
+impl Crew {
+    fn start() -> std::io::Result<Self> {
+        let count = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+        let member = |number: usize| {
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+            let (handle, (leave, left)) = (runtime.handle().clone(), oneshot::channel::<()>());
+            std::thread::Builder::new().name(format!("serve-{number}")).spawn(move || {
+                // Until the crew is dropped.
+                let _ = runtime.block_on(left);
+                // Whoever still waits for the disk is not waited for.
+                runtime.shutdown_background();
+            })?;
+            Ok((handle, leave))
+        };
+        let members = (0..count).map(member).collect::<std::io::Result<_>>()?;
+        Ok(Self { members, next: AtomicUsize::new(0) })
+    }
+
+    /// Leaves a connection to the next member.
+    fn spawn(&self, visit: impl Future<Output = ()> + Send + 'static) {
+        let number = self.next.fetch_add(1, Ordering::Relaxed) % self.members.len();
+        self.members[number].0.spawn(visit);
+    }
 }
 
-impl http_body::Body for Held {
-    type Data = Bytes;
-    type Error = axum::Error;
+/// A connection that has its place, and all that serves it.
+struct Visit {
+    builder: Arc<auto::Builder<TokioExecutor>>,
+    front: Arc<Front>,
+    watcher: Watcher,
+    connection: Arc<Connection>,
+    patience: Patience,
+}
 
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
-        if Instant::now() > self.due {
-            return Poll::Ready(Some(Err(axum::Error::new("this answer took too long"))));
+impl Visit {
+    /// Answers what is asked on a connection, until it ends.
+    async fn serve(self, stream: impl AsyncRead + AsyncWrite + Send + 'static) {
+        let Self { builder, front, watcher, connection, patience } = self;
+        let from = connection.from;
+        let io = TokioIo::new(Box::pin(Watched::new(stream, Arc::clone(&connection.activity), patience)));
+        let service = service_fn(move |request| {
+            let (front, connection) = (Arc::clone(&front), Arc::clone(&connection));
+            async move { Ok::<_, Infallible>(front.answer(&connection, request).await) }
+        });
+        let served = builder.serve_connection(io, service).into_owned();
+        if let Err(error) = watcher.watch(served).await {
+            tracing::debug!(%error, %from, "connection");
         }
-        Pin::new(&mut self.body).poll_frame(context)
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
     }
 }
 
@@ -195,6 +204,7 @@ struct Places {
     all: Arc<Semaphore>,
     by_address: Arc<Mutex<HashMap<IpAddr, u32>>>,
     most: u32,
+    metrics: Arc<Metrics>,
 }
 
 /// One of them; free again once dropped.
@@ -202,28 +212,33 @@ struct Place {
     _all: OwnedSemaphorePermit,
     by_address: Arc<Mutex<HashMap<IpAddr, u32>>>,
     address: IpAddr,
+    metrics: Arc<Metrics>,
 }
 
 impl Places {
-    fn new(limits: &Limits) -> Self {
+    fn new(limits: &Limits, metrics: Arc<Metrics>) -> Self {
         let all = Arc::new(Semaphore::new(limits.max_connections as usize));
-        Self { all, by_address: Arc::default(), most: limits.max_connections_per_address }
+        Self { all, by_address: Arc::default(), most: limits.max_connections_per_address, metrics }
     }
 
-    fn take(&self, address: IpAddr) -> Option<Place> {
-        let all = Arc::clone(&self.all).try_acquire_owned().ok()?;
+    /// A place, or which limit leaves none.
+    fn take(&self, address: IpAddr) -> Result<Place, &'static str> {
+        let all = Arc::clone(&self.all).try_acquire_owned().map_err(|_| "connections")?;
         let mut by_address = self.by_address.lock().unwrap_or_else(PoisonError::into_inner);
         let count = by_address.entry(address).or_insert(0);
         if *count >= self.most {
-            return None;
+            return Err("connections_of_address");
         }
         *count += 1;
-        Some(Place { _all: all, by_address: Arc::clone(&self.by_address), address })
+        self.metrics.connections.inc();
+        let (by_address, metrics) = (Arc::clone(&self.by_address), Arc::clone(&self.metrics));
+        Ok(Place { _all: all, by_address, address, metrics })
     }
 }
 
 impl Drop for Place {
     fn drop(&mut self) {
+        self.metrics.connections.dec();
         let mut by_address = self.by_address.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(count) = by_address.get_mut(&self.address) {
             *count -= 1;

@@ -5,6 +5,7 @@
 //! version before goes on with it: its files stay open even where the build has removed them.
 
 use super::ServeError;
+use super::metrics::Metrics;
 use crate::store::{Store, StoreError};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -16,7 +17,7 @@ const LEFT_ALONE: Duration = Duration::from_secs(60);
 
 /// Scenes by name.
 #[derive(Debug)]
-pub struct Scenes(RwLock<BTreeMap<String, Shown>>);
+pub(super) struct Scenes(RwLock<BTreeMap<String, Shown>>);
 
 #[derive(Debug)]
 struct Shown {
@@ -89,12 +90,13 @@ impl Scenes {
 
     /// Looks whether other versions were published, and goes over to those that are sound. Versions before are
     /// served for `grace` more.
-    pub(super) fn refresh(&self, grace: Duration) {
+    pub(super) fn refresh(&self, grace: Duration, metrics: &Metrics) {
         for store in self.all() {
             let name = &store.scene().name;
             self.change(name, |shown| shown.before.retain(|(_, until)| *until > Instant::now()));
             let refuse = |version: &str, reason: &dyn std::fmt::Display| {
                 tracing::error!(scene = name, version, %reason, "another version was published, and is not served");
+                metrics.swaps_refused.inc();
                 self.change(name, |shown| shown.refused = Some((version.to_owned(), Instant::now())));
             };
             let version = match Store::published(store.root()) {
@@ -112,6 +114,7 @@ impl Scenes {
                         version = newer.scene().version,
                         "another version is served"
                     );
+                    metrics.swaps.inc();
                     self.change(name, |shown| {
                         let before = std::mem::replace(&mut shown.now, Arc::new(newer));
                         shown.before.push((before, Instant::now() + grace));

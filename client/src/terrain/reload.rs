@@ -1,0 +1,107 @@
+//! Going over to another version of a scene that was replaced while it was looked at.
+//!
+//! What is here stays on the screen. Meanwhile the scene is opened again, on a thread, and what the view needs of it is
+//! loaded, beside what is drawn; once it is as exact, it takes over, in one frame. While both are there, they take
+//! twice the memory.
+
+use super::{FrameView, Options, Terrain, TerrainError};
+use crate::camera::Camera;
+use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
+use std::time::{Duration, Instant};
+
+/// How long before a scene that could not be opened again is tried once more.
+const PAUSE: Duration = Duration::from_secs(5);
+
+/// The other version.
+#[derive(Debug)]
+pub(super) enum Reload {
+    Opening(Receiver<Result<Terrain, TerrainError>>),
+    Loading(Box<Terrain>),
+    /// It could not be opened, and is not tried before this moment.
+    Failed(Instant),
+}
+
+/// Opens a scene on a thread. A build drops zones: without the one asked for, all of it counts.
+fn open(url: &str, options: &Options) -> Reload {
+    let (sender, receiver) = sync_channel(1);
+    let (url, options) = (url.to_owned(), options.clone());
+    let started = std::thread::Builder::new().name("diamantina-reload".to_owned()).spawn(move || {
+        let opened = match Terrain::open(&url, options.clone()) {
+            Err(TerrainError::Zone { .. }) => Terrain::open(&url, Options { zone: None, ..options }),
+            other => other,
+        };
+        // Nobody waits for it any more when the terrain is dropped.
+        let _ = sender.send(opened);
+    });
+    started.map_or_else(|_| Reload::Failed(Instant::now() + PAUSE), |_| Reload::Opening(receiver))
+}
+
+impl Reload {
+    /// Whether nothing more comes for now.
+    pub(super) fn is_stuck(&self) -> bool {
+        match self {
+            Self::Opening(_) => false,
+            Self::Loading(next) => next.is_stuck(),
+            Self::Failed(_) => true,
+        }
+    }
+}
+
+impl Terrain {
+    /// A frame of the version that took this one's place, if it is ready, or else `None`. It takes over then.
+    pub(super) fn go_over(&mut self, camera: &Camera, seconds: f64) -> Option<FrameView> {
+        let mut reload = match self.reload.take() {
+            None => open(&self.url, &self.options),
+            Some(Reload::Failed(until)) if Instant::now() >= until => open(&self.url, &self.options),
+            Some(Reload::Opening(receiver)) => match receiver.try_recv() {
+                Ok(Ok(next)) => Reload::Loading(Box::new(next)),
+                Ok(Err(error)) => {
+                    self.problem = Some(error.to_string());
+                    Reload::Failed(Instant::now() + PAUSE)
+                }
+                Err(TryRecvError::Empty) => Reload::Opening(receiver),
+                Err(TryRecvError::Disconnected) => Reload::Failed(Instant::now() + PAUSE),
+            },
+            Some(other) => other,
+        };
+        let mut ready = None;
+        if let Reload::Loading(next) = &mut reload {
+            next.options.tolerance_pixels = self.options.tolerance_pixels;
+            next.options.exaggeration = self.options.exaggeration;
+            let view = next.draw_at(camera, seconds);
+            let is_as_exact = view.error_pixels <= self.error_pixels || view.complete || next.is_stuck();
+            if view.error_pixels.is_finite() && is_as_exact {
+                ready = Some(view);
+            }
+        }
+        // Replaced again already, or caches on the way do not agree on what there is.
+        if matches!(&reload, Reload::Loading(next) if next.scene_changed) {
+            reload = Reload::Failed(Instant::now() + PAUSE);
+        }
+        match (ready, reload) {
+            (Some(mut view), Reload::Loading(next)) => {
+                self.become_next(*next);
+                self.note_traffic();
+                view.stats = self.stats;
+                Some(view)
+            }
+            (_, reload) => {
+                self.reload = Some(reload);
+                None
+            }
+        }
+    }
+
+    /// Goes on as another version. What was counted counts on.
+    fn become_next(&mut self, mut next: Self) {
+        next.opened = self.opened;
+        next.traffic_before = self.traffic_before.plus(&self.fetcher.traffic());
+        next.stats.reloads = self.stats.reloads + 1;
+        next.stats.first_picture_seconds = self.stats.first_picture_seconds;
+        next.stats.asked_error_seconds = self.stats.asked_error_seconds;
+        let before = std::mem::replace(self, next);
+        tracing::info!(version = self.scene.version, "another version of the scene took over");
+        // Its threads end by and by: no frame waits for them.
+        std::thread::spawn(move || drop(before));
+    }
+}

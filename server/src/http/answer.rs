@@ -1,0 +1,98 @@
+//! What answers are made of: refusals in words, tags, and who has something already.
+
+use crate::store::StoreError;
+use axum::body::Body;
+use axum::http::{HeaderMap, HeaderName, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use diamantina_protocol::message::Problem;
+use std::sync::Arc;
+
+/// For what never changes.
+pub(super) const IMMUTABLE: &str = "public, max-age=31536000, immutable";
+
+/// For the same of a private scene: no cache that others share may keep it.
+pub(super) const IMMUTABLE_PRIVATE: &str = "private, max-age=31536000, immutable";
+
+pub(super) const OCTETS: &str = "application/octet-stream";
+
+/// A refusal, sent as problem+json (RFC 9457).
+pub(super) struct Refusal {
+    status: StatusCode,
+    detail: String,
+    /// What the log is told and the answer is not.
+    cause: Option<Cause>,
+}
+
+/// What went wrong on our side, in the extensions of an answer.
+#[derive(Debug, Clone)]
+pub(super) struct Cause(pub(super) Arc<str>);
+
+impl Refusal {
+    pub(super) fn new(status: StatusCode, detail: impl Into<String>) -> Self {
+        Self { status, detail: detail.into(), cause: None }
+    }
+
+    /// What is served here is damaged. The log says where; the answer does not tell strangers about our disks.
+    pub(super) fn damaged(cause: &dyn std::fmt::Display) -> Self {
+        let refusal =
+            Self::new(StatusCode::INTERNAL_SERVER_ERROR, "the store is damaged here: the log says where");
+        Self { cause: Some(Cause(cause.to_string().into())), ..refusal }
+    }
+}
+
+impl IntoResponse for Refusal {
+    fn into_response(self) -> Response {
+        let title = self.status.canonical_reason().unwrap_or("Error").to_owned();
+        let problem = Problem { title, status: self.status.as_u16(), detail: self.detail };
+        let body = serde_json::to_vec(&problem).unwrap_or_default();
+        let headers =
+            [(header::CONTENT_TYPE, "application/problem+json"), (header::CACHE_CONTROL, "no-store")];
+        let mut response = (self.status, headers, body).into_response();
+        if let Some(cause) = self.cause {
+            response.extensions_mut().insert(cause);
+        }
+        response
+    }
+}
+
+impl From<StoreError> for Refusal {
+    fn from(error: StoreError) -> Self {
+        Self::damaged(&error)
+    }
+}
+
+/// An answer with an ETag; 304 where the client has it already, 412 where it wants only another.
+pub(super) fn tagged(
+    headers: &HeaderMap,
+    tag: &str,
+    cache: &'static str,
+    kind: &'static str,
+    body: impl FnOnce() -> Body,
+) -> Response {
+    if headers.contains_key(header::IF_MATCH) && !names(headers, &header::IF_MATCH, tag) {
+        let detail = format!("this has the tag \"{tag}\", which If-Match does not name");
+        return Refusal::new(StatusCode::PRECONDITION_FAILED, detail).into_response();
+    }
+    let common = [(header::ETAG, format!("\"{tag}\"")), (header::CACHE_CONTROL, cache.to_owned())];
+    if names(headers, &header::IF_NONE_MATCH, tag) {
+        return (StatusCode::NOT_MODIFIED, common).into_response();
+    }
+    (common, [(header::CONTENT_TYPE, kind)], body()).into_response()
+}
+
+/// Whether a header names this tag. Tags here are strong; only `If-None-Match` takes weak ones for the same.
+fn names(headers: &HeaderMap, header: &HeaderName, tag: &str) -> bool {
+    let lists = headers.get_all(header).iter().filter_map(|value| value.to_str().ok());
+    lists.flat_map(|list| list.split(',')).any(|item| {
+        let item = item.trim();
+        let item = if *header == header::IF_NONE_MATCH { item.trim_start_matches("W/") } else { item };
+        item == "*" || item.strip_prefix('"').and_then(|rest| rest.strip_suffix('"')) == Some(tag)
+    })
+}
+
+/// JSON that is asked for again each time, by its ETag.
+pub(super) fn json(headers: &HeaderMap, value: &impl serde::Serialize) -> Response {
+    let body = serde_json::to_vec(value).unwrap_or_default();
+    let hash = blake3::hash(&body).to_hex();
+    tagged(headers, &hash[..16], "no-cache", "application/json", || body.into())
+}

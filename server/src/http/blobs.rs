@@ -1,0 +1,158 @@
+//! Blobs of stores, the hot ones kept in memory.
+//!
+//! A blob is read from its store, and checked there, at most once as long as it is kept; answers share its bytes. What is
+//! asked for again and again stays, what is asked for once soon goes (quick_cache's S3-FIFO), and the budget is of bytes.
+
+use super::metrics::Metrics;
+use crate::store::{Key, Store, StoreError};
+use bytes::Bytes;
+use quick_cache::sync::{Cache, DefaultLifecycle};
+use quick_cache::{DefaultHashBuilder, OptionsBuilder, Weighter};
+use std::sync::Arc;
+use std::time::Instant;
+
+/// What a blob takes in memory beside its bytes: its key, its place among the others, its allocation.
+const OVERHEAD_BYTES: u64 = 128;
+
+/// Parts of the cache that do not wait for one another. Blobs larger than a part's budget are not kept.
+const SHARDS: usize = 8;
+
+/// A blob of a version of a scene; a version is a hash of all its content.
+type Name = (u64, Key);
+
+#[derive(Debug, Clone)]
+struct ByBytes;
+
+impl Weighter<Name, Bytes> for ByBytes {
+    fn weight(&self, _: &Name, blob: &Bytes) -> u64 {
+        blob.len() as u64 + OVERHEAD_BYTES
+    }
+}
+
+/// Reads blobs, and keeps some.
+#[derive(Debug)]
+pub(super) struct Blobs {
+    cache: Option<Cache<Name, Bytes, ByBytes>>,
+    metrics: Arc<Metrics>,
+}
+
+fn name(store: &Store, key: Key) -> Name {
+    let version = &store.scene().version;
+    (u64::from_str_radix(version, 16).unwrap_or_else(|_| xxhash_rust::xxh3::xxh3_64(version.as_bytes())), key)
+}
+
+impl Blobs {
+    /// Keeps blobs of at most `budget` bytes; 0 keeps none.
+    pub(super) fn new(budget: u64, metrics: Arc<Metrics>) -> Self {
+        let mut options = OptionsBuilder::new();
+        // The number of items is a hint for the first allocation alone.
+        options.weight_capacity(budget).estimated_items_capacity(1024).shards(SHARDS);
+        let cache = options.build().ok().filter(|_| budget > 0).map(|options| {
+            Cache::with_options(options, ByBytes, DefaultHashBuilder::default(), DefaultLifecycle::default())
+        });
+        Self { cache, metrics }
+    }
+
+    /// The blob, if it is kept.
+    pub(super) fn held(&self, store: &Store, key: Key) -> Option<Bytes> {
+        let found = self.cache.as_ref()?.get(&name(store, key));
+        if found.is_some() {
+            self.metrics.cache_hits.inc();
+        }
+        found
+    }
+
+    /// Reads the blob of a key from its store, checked; `None` if there is none. It waits for the disk.
+    ///
+    /// # Errors
+    /// When the disk fails or the blob does not match its checksum.
+    pub(super) fn read(&self, store: &Store, key: Key) -> Result<Option<Bytes>, StoreError> {
+        let started = Instant::now();
+        let read = store.get(key).inspect_err(|error| self.failed(error))?;
+        if let Some(blob) = &read {
+            self.metrics.cache_misses.inc();
+            self.metrics.store_reads.inc();
+            self.metrics.store_read_bytes.inc_by(blob.len() as u64);
+            self.metrics.store_read_seconds.observe(started.elapsed().as_secs_f64());
+            if let Some(cache) = &self.cache {
+                cache.insert(name(store, key), blob.clone());
+            }
+        }
+        Ok(read)
+    }
+
+    /// Counts a blob that could not be read.
+    pub(super) fn failed(&self, error: &StoreError) {
+        if matches!(error, StoreError::Damaged { .. }) {
+            self.metrics.checksum_failures.inc();
+        } else {
+            self.metrics.store_errors.inc();
+        }
+    }
+
+    /// The blob of a key; `None` if there is none. Only who waits for the disk leaves the async thread.
+    ///
+    /// # Errors
+    /// As [`Blobs::read`].
+    pub(super) async fn get(
+        self: &Arc<Self>,
+        store: &Arc<Store>,
+        key: Key,
+    ) -> Result<Option<Bytes>, StoreError> {
+        if !store.has(key) {
+            return Ok(None);
+        }
+        if let Some(blob) = self.held(store, key) {
+            return Ok(Some(blob));
+        }
+        let (blobs, at) = (Arc::clone(self), Arc::clone(store));
+        match tokio::task::spawn_blocking(move || blobs.read(&at, key)).await {
+            Ok(read) => read,
+            // The runtime ends, and nobody waits for this.
+            Err(_) => Ok(None),
+        }
+    }
+
+    /// Tells the metrics how full the cache is.
+    pub(super) fn measure(&self) {
+        let (blobs, bytes) = self.cache.as_ref().map_or((0, 0), |cache| (cache.len() as u64, cache.weight()));
+        self.metrics.cache_blobs.set(i64::try_from(blobs).unwrap_or(i64::MAX));
+        self.metrics.cache_bytes.set(i64::try_from(bytes).unwrap_or(i64::MAX));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::store::Kind;
+
+    fn name(number: u32) -> Name {
+        (7, Key { layer: 0, kind: Kind::Points, a: number, b: 0 })
+    }
+
+    #[test]
+    fn what_is_kept_stays_within_its_bytes_and_what_is_asked_for_stays() {
+        let blobs = Blobs::new(8 << 20, Arc::new(Metrics::new()));
+        let cache = blobs.cache.as_ref().unwrap();
+        let blob = Bytes::from(vec![0; 10_000]);
+        for number in 0..5000 {
+            cache.insert(name(number), blob.clone());
+            // These ten are hot.
+            for hot in 0..10 {
+                if cache.get(&name(hot)).is_none() {
+                    assert!(number < 200, "what is hot went at {number}");
+                    cache.insert(name(hot), blob.clone());
+                }
+            }
+            assert!(cache.weight() <= 8 << 20, "{}", cache.weight());
+        }
+        assert!(cache.len() > 400 && cache.get(&name(4999)).is_some());
+        blobs.measure();
+        assert!(blobs.metrics.cache_bytes.get() > 4 << 20);
+    }
+
+    #[test]
+    fn without_a_budget_nothing_is_kept() {
+        assert!(Blobs::new(0, Arc::new(Metrics::new())).cache.is_none());
+    }
+}

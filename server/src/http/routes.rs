@@ -1,0 +1,413 @@
+//! What each kind of address is answered with. One function answers for each, whatever the encoding.
+
+use super::Site;
+use super::access::Caller;
+use super::answer::{IMMUTABLE, IMMUTABLE_PRIVATE, OCTETS, Refusal, json, tagged};
+use super::contract::{self, About, Form, Holds};
+use super::many::{self, Batch};
+use super::metrics::{Route, metrics};
+use super::scenes::Found;
+use crate::height::{self, HeightError};
+use crate::store::{Key, Kind, Store, zones};
+use crate::stream::Stream;
+use axum::Router;
+use axum::extract::{Path, Query, State};
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::middleware::map_response;
+use axum::response::{Html, IntoResponse, Response};
+use axum::routing::{MethodRouter, get};
+use diamantina_protocol::bintree::Forest;
+use diamantina_protocol::index;
+use diamantina_protocol::message::{self, BATCH_MAX, Catalogue, Layer, STREAM_MAX, Scene};
+use std::collections::HashMap;
+use std::sync::Arc;
+
+type Methods = MethodRouter<Arc<Site>>;
+
+/// A route: its template, what is told of it, who answers.
+type Line = (&'static str, About, Methods);
+
+const fn about(summary: &'static str, holds: Holds) -> About {
+    About { summary, holds, query: &[], refusals: &[] }
+}
+
+/// About something of a version, or of a scene.
+const fn below(summary: &'static str, refusals: &'static [u16]) -> About {
+    About { summary, holds: Holds::Octets, query: &[], refusals }
+}
+
+/// About many diamonds at once.
+const BATCH: About = About {
+    query: &[("d", true, Form::Centres)],
+    ..below("Many diamonds, coarse first, in frames", &[400, 404, 410])
+};
+
+const STREAM: About = About {
+    query: &[
+        ("bbox", false, Form::Numbers),
+        ("error", false, Form::Number),
+        ("limit", false, Form::Bytes),
+        ("eye", false, Form::Numbers),
+        ("angle", false, Form::Number),
+        ("sides", false, Form::Numbers),
+        ("vertical", false, Form::Text),
+    ],
+    ..below("A region or a view, the largest errors first, in frames", &[400, 404, 410])
+};
+
+const HEIGHT: About = About {
+    query: &[
+        ("x", false, Form::Number),
+        ("y", false, Form::Number),
+        ("lon", false, Form::Number),
+        ("lat", false, Form::Number),
+    ],
+    refusals: &[400, 404, 500],
+    ..about("The height at a place, x and y in metres or lon and lat in degrees", Holds::Json)
+};
+
+/// All routes.
+fn lines() -> Vec<Line> {
+    let well = || get(|| async { ([(header::CACHE_CONTROL, "no-store")], "ok\n") });
+    let page = below("A page of the index, zstd-compressed", &[404, 410, 500]);
+    let diamond = below("One diamond, named by its centre", &[404, 410, 500]);
+    vec![
+        ("/", about("What there is, for people", Holds::Html), get(front_page)),
+        ("/health", about("Whether the server answers", Holds::Text), well()),
+        ("/ready", about("Whether it will go on", Holds::Text), well()),
+        ("/metrics", about("What was counted", Holds::Metrics), get(metrics)),
+        ("/scenes", about("All scenes", Holds::Json), get(catalogue)),
+        (
+            "/scenes/{scene}",
+            About { refusals: &[404], ..about("A scene at its newest version", Holds::Json) },
+            get(scene),
+        ),
+        ("/scenes/{scene}/{layer}/height", HEIGHT, get(height_at)),
+        (
+            "/scenes/{scene}/{version}/zones/{zone}",
+            below("What is seen from a zone, zstd-compressed", &[404, 410, 500]),
+            get(zone),
+        ),
+        ("/scenes/{scene}/{version}/{layer}/index/{page}", page, pages(points)),
+        ("/scenes/{scene}/{version}/{layer}/points", BATCH, batches(points)),
+        ("/scenes/{scene}/{version}/{layer}/points/{x}/{y}", diamond, diamonds(points)),
+        ("/scenes/{scene}/{version}/{layer}/tin/index/{page}", page, pages(tin)),
+        ("/scenes/{scene}/{version}/{layer}/tin", BATCH, batches(tin)),
+        ("/scenes/{scene}/{version}/{layer}/tin/{x}/{y}", diamond, diamonds(tin)),
+        ("/scenes/{scene}/{version}/{layer}/stream", STREAM, get(stream)),
+    ]
+}
+
+/// The requests that a site answers.
+pub(super) fn router(site: Arc<Site>) -> Router {
+    let mut lines = lines();
+    let ours = ("/openapi.json", about("This document", Holds::Json));
+    let told = lines.iter().map(|(template, about, _)| (*template, about)).chain([(ours.0, &ours.1)]);
+    let document = Arc::new(contract::document(told));
+    let tell = get(move |headers: HeaderMap| async move { json(&headers, &*document) });
+    lines.push((ours.0, ours.1, tell));
+    let mut router = Router::new();
+    for (template, _, methods) in lines {
+        let named = move |mut response: Response| async move {
+            response.extensions_mut().insert(Route(template));
+            response
+        };
+        router = router.route(template, methods.layer(map_response(named)));
+    }
+    router
+        .fallback(|| async {
+            Refusal::new(StatusCode::NOT_FOUND, "no such address: GET /scenes lists what there is")
+        })
+        .method_not_allowed_fallback(|| async {
+            let refusal = Refusal::new(StatusCode::METHOD_NOT_ALLOWED, "only GET and HEAD are answered");
+            ([(header::ALLOW, "GET, HEAD, OPTIONS")], refusal)
+        })
+        .with_state(site)
+}
+
+async fn front_page(State(site): State<Arc<Site>>, caller: Caller) -> Html<String> {
+    let mut page = String::from(
+        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content=\"width=device-width\"><title>Diamantina</title>\
+         <style>body{font:16px/1.5 system-ui;max-width:44rem;margin:3rem auto;padding:0 1rem}code{background:#eee;padding:.1em .3em}</style>\
+         <h1>Diamantina</h1><p>This server streams terrain. Open a scene with the client:</p><ul>",
+    );
+    for store in site.visible(caller) {
+        let name = &store.scene().name;
+        // Names are letters, digits, '-', '_' and '.': nothing to escape.
+        page += &format!(
+            "<li><a href=/scenes/{name}>{name}</a> <code>diamantina-client render http://THIS-SERVER/scenes/{name} -o {name}.png</code>"
+        );
+    }
+    page += "</ul><p><a href=/scenes>All scenes as JSON</a></html>";
+    Html(page)
+}
+
+async fn catalogue(State(site): State<Arc<Site>>, caller: Caller, headers: HeaderMap) -> Response {
+    let scenes: Vec<Scene> = site.visible(caller).iter().map(|s| s.scene().clone()).collect();
+    json(&headers, &Catalogue { scenes })
+}
+
+/// The newest version of a scene.
+fn find_scene(site: &Site, caller: Caller, name: &str) -> Result<Arc<Store>, Refusal> {
+    site.scenes.newest(name).filter(|_| site.access.allows(caller, name)).ok_or_else(no_scene)
+}
+
+fn no_scene() -> Refusal {
+    Refusal::new(StatusCode::NOT_FOUND, "no such scene: GET /scenes lists them")
+}
+
+/// The layer of an address, with its number.
+fn find_layer<'a>(store: &'a Store, name: &str) -> Result<(u8, &'a Layer), Refusal> {
+    let found = store.scene().layers.iter().enumerate().find(|(_, l)| l.name == name);
+    let (number, layer) =
+        found.ok_or_else(|| Refusal::new(StatusCode::NOT_FOUND, "no such layer in this scene"))?;
+    Ok((u8::try_from(number).unwrap_or(u8::MAX), layer))
+}
+
+/// The store of an address with a version, and what caches may do with what is in it.
+fn find_version(
+    site: &Site,
+    caller: Caller,
+    name: &str,
+    version: &str,
+) -> Result<(Arc<Store>, &'static str), Refusal> {
+    let found = site.scenes.at(name, version).filter(|_| site.access.allows(caller, name));
+    match found.ok_or_else(no_scene)? {
+        Found::Store(store) if site.access.is_private(name) => Ok((store, IMMUTABLE_PRIVATE)),
+        Found::Store(store) => Ok((store, IMMUTABLE)),
+        Found::Gone(current) => Err(Refusal::new(
+            StatusCode::GONE,
+            format!("scene '{name}' is now at version {current}: load its description again"),
+        )),
+    }
+}
+
+async fn scene(
+    State(site): State<Arc<Site>>,
+    caller: Caller,
+    Path(name): Path<String>,
+    headers: HeaderMap,
+) -> Result<Response, Refusal> {
+    Ok(json(&headers, find_scene(&site, caller, &name)?.scene()))
+}
+
+/// One of the encodings of a layer.
+#[derive(Clone, Copy)]
+struct Encoding {
+    forest: Forest,
+    payload: Kind,
+    page: Kind,
+    /// What ETags of its payloads and pages have in front.
+    letters: [&'static str; 2],
+}
+
+/// The encoding `points` of a layer.
+fn points(layer: &Layer) -> Result<Encoding, Refusal> {
+    if !layer.encodings.iter().any(|e| e == "points") {
+        return Err(Refusal::new(
+            StatusCode::NOT_FOUND,
+            "this layer has no points, only what its encodings list",
+        ));
+    }
+    Ok(Encoding { forest: layer.forest, payload: Kind::Points, page: Kind::Index, letters: ["p", "i"] })
+}
+
+/// The encoding `tin` of a layer.
+fn tin(layer: &Layer) -> Result<Encoding, Refusal> {
+    let Some(tin) = &layer.tin else {
+        return Err(Refusal::new(
+            StatusCode::NOT_FOUND,
+            "this layer has no triangles: build it with --encoding points,tin",
+        ));
+    };
+    Ok(Encoding { forest: tin.forest, payload: Kind::Tin, page: Kind::TinIndex, letters: ["t", "j"] })
+}
+
+type PagePath = Path<(String, String, String, String)>;
+type DiamondPath = Path<(String, String, String, String, String)>;
+type BatchPath = Path<(String, String, String)>;
+type Ask = Query<HashMap<String, String>>;
+
+/// Finds one of the encodings of a layer.
+type Find = fn(&Layer) -> Result<Encoding, Refusal>;
+
+/// Answers with pages of the index of an encoding.
+fn pages(encoding: Find) -> Methods {
+    get(move |State(site): State<Arc<Site>>, caller: Caller, path: PagePath, headers: HeaderMap| async move {
+        page_of(&site, caller, path, &headers, encoding).await
+    })
+}
+
+/// Answers with diamonds of an encoding, one by one.
+fn diamonds(encoding: Find) -> Methods {
+    get(
+        move |State(site): State<Arc<Site>>, caller: Caller, path: DiamondPath, headers: HeaderMap| async move {
+            diamond_of(&site, caller, path, &headers, encoding).await
+        },
+    )
+}
+
+/// Answers with many diamonds of an encoding at once.
+fn batches(encoding: Find) -> Methods {
+    get(
+        move |State(site): State<Arc<Site>>,
+              caller: Caller,
+              path: BatchPath,
+              query: Ask,
+              headers: HeaderMap| async move { batch_of(&site, caller, path, &query, &headers, encoding) },
+    )
+}
+
+async fn page_of(
+    site: &Site,
+    caller: Caller,
+    Path((name, version, layer, page)): PagePath,
+    headers: &HeaderMap,
+    encoding: Find,
+) -> Result<Response, Refusal> {
+    let (store, cache) = find_version(site, caller, &name, &version)?;
+    let (number, layer) = find_layer(&store, &layer)?;
+    let encoding = encoding(layer)?;
+    let pages = index::pages(&encoding.forest);
+    let missing = || {
+        Refusal::new(StatusCode::NOT_FOUND, format!("no such page: the index has pages 0 to {}", pages - 1))
+    };
+    let page: u32 = page.parse().map_err(|_| missing())?;
+    let key = Key { layer: number, kind: encoding.page, a: page, b: 0 };
+    let blob = site.blobs.get(&store, key).await?.ok_or_else(missing)?;
+    let tag = format!("{version}-{number}-{}{page}", encoding.letters[1]);
+    Ok(tagged(headers, &tag, cache, OCTETS, || blob.into()))
+}
+
+async fn zone(
+    State(site): State<Arc<Site>>,
+    caller: Caller,
+    Path((name, version, zone)): Path<(String, String, String)>,
+    headers: HeaderMap,
+) -> Result<Response, Refusal> {
+    let (store, cache) = find_version(&site, caller, &name, &version)?;
+    let missing =
+        || Refusal::new(StatusCode::NOT_FOUND, "no such zone: the scene's description lists its zones");
+    let position = store.scene().zones.iter().position(|z| z.name == zone).ok_or_else(missing)?;
+    let blob = site.blobs.get(&store, zones::key(position)).await?.ok_or_else(missing)?;
+    Ok(tagged(&headers, &format!("{version}-z{position}"), cache, OCTETS, || blob.into()))
+}
+
+async fn diamond_of(
+    site: &Site,
+    caller: Caller,
+    Path((name, version, layer, x, y)): DiamondPath,
+    headers: &HeaderMap,
+    encoding: Find,
+) -> Result<Response, Refusal> {
+    let (store, cache) = find_version(site, caller, &name, &version)?;
+    let (number, layer) = find_layer(&store, &layer)?;
+    let encoding = encoding(layer)?;
+    let no_diamond = || Refusal::new(StatusCode::NOT_FOUND, "no diamond with a payload has its centre there");
+    let centre = [x.parse().map_err(|_| no_diamond())?, y.parse().map_err(|_| no_diamond())?];
+    encoding.forest.diamond(centre).ok_or_else(no_diamond)?;
+    let key = Key { layer: number, kind: encoding.payload, a: centre[0], b: centre[1] };
+    let blob = site.blobs.get(&store, key).await?.ok_or_else(no_diamond)?;
+    let tag = format!("{version}-{number}-{}{}-{}", encoding.letters[0], centre[0], centre[1]);
+    Ok(tagged(headers, &tag, cache, OCTETS, || blob.into()))
+}
+
+/// A short name for a question: however it was written, the same one has the same.
+fn question(text: &str) -> String {
+    blake3::hash(text.as_bytes()).to_hex()[..16].to_owned()
+}
+
+fn batch_of(
+    site: &Site,
+    caller: Caller,
+    Path((name, version, layer)): BatchPath,
+    query: &HashMap<String, String>,
+    headers: &HeaderMap,
+    encoding: Find,
+) -> Result<Response, Refusal> {
+    let (store, cache) = find_version(site, caller, &name, &version)?;
+    let (number, Encoding { forest, payload, letters, .. }) = {
+        let (number, layer) = find_layer(&store, &layer)?;
+        (number, encoding(layer)?)
+    };
+    let list =
+        query.get("d").ok_or_else(|| Refusal::new(StatusCode::BAD_REQUEST, "expected ?d=x,y;x,y;..."))?;
+    let centres = message::parse_batch(list).map_err(|e| match e {
+        message::BatchError::Many => Refusal::new(
+            StatusCode::PAYLOAD_TOO_LARGE,
+            format!("at most {BATCH_MAX} diamonds in one request"),
+        ),
+        message::BatchError::Syntax(_) => Refusal::new(StatusCode::BAD_REQUEST, e.to_string()),
+    })?;
+    // Coarse first, so that whatever arrives can be decoded; unknown centres last.
+    let mut order: Vec<_> =
+        centres.into_iter().map(|c| (forest.diamond(c).map_or(u32::MAX, |d| d.level()), c)).collect();
+    order.sort_by_key(|(level, _)| *level);
+    let centres = order.into_iter().map(|(_, centre)| centre).collect();
+    let tag = format!("{version}-{number}-{}b{}", letters[0], question(list));
+    let blobs = Arc::clone(&site.blobs);
+    let batch = Batch { blobs, store, layer: number, kind: payload, centres };
+    Ok(tagged(headers, &tag, cache, OCTETS, || many::batch(batch)))
+}
+
+async fn stream(
+    State(site): State<Arc<Site>>,
+    caller: Caller,
+    Path((name, version, layer)): Path<(String, String, String)>,
+    Query(query): Query<Vec<(String, String)>>,
+    headers: HeaderMap,
+) -> Result<Response, Refusal> {
+    let (store, cache) = find_version(&site, caller, &name, &version)?;
+    let (number, layer) = find_layer(&store, &layer)?;
+    points(layer)?;
+    let ask = message::parse_stream(query.iter().map(|(name, value)| (name.as_str(), value.as_str())))
+        .map_err(|e| Refusal::new(StatusCode::BAD_REQUEST, e.to_string()))?;
+    let tag = format!("{version}-{number}-s{}", question(&message::stream_route("", "", "", &ask)));
+    let stream = Stream::new(Arc::clone(&store), number, layer, ask, STREAM_MAX);
+    Ok(tagged(&headers, &tag, cache, OCTETS, || many::stream(stream, &site.blobs)))
+}
+
+async fn height_at(
+    State(site): State<Arc<Site>>,
+    caller: Caller,
+    Path((name, layer)): Path<(String, String)>,
+    Query(query): Query<HashMap<String, String>>,
+) -> Result<Response, Refusal> {
+    let store = find_scene(&site, caller, &name)?;
+    points(find_layer(&store, &layer)?.1)?;
+    let number = |key: &str| -> Result<Option<f64>, Refusal> {
+        let Some(text) = query.get(key) else { return Ok(None) };
+        let value = text.parse::<f64>().ok().filter(|v| v.is_finite());
+        value.map(Some).ok_or_else(|| Refusal::new(StatusCode::BAD_REQUEST, format!("{key} is not a number")))
+    };
+    let asked = (number("x")?, number("y")?, number("lon")?, number("lat")?);
+    let answer = tokio::task::spawn_blocking(move || {
+        let crs = store.scene().frame.crs.as_ref();
+        let place = match asked {
+            (Some(x), Some(y), None, None) => [x, y],
+            (None, None, Some(lon), Some(lat)) => height::to_frame(crs, lon, lat).map_err(refuse_height)?,
+            _ => {
+                return Err(Refusal::new(
+                    StatusCode::BAD_REQUEST,
+                    "expected ?x=&y= in metres or ?lon=&lat= in degrees",
+                ));
+            }
+        };
+        let (number, layer) = find_layer(&store, &layer)?;
+        height::height(&store, number, layer, crs, place).map_err(refuse_height)
+    });
+    let answer = answer
+        .await
+        .map_err(|_| Refusal::new(StatusCode::INTERNAL_SERVER_ERROR, "the height could not be computed"))??;
+    Ok(([(header::CACHE_CONTROL, "no-cache")], axum::Json(answer)).into_response())
+}
+
+fn refuse_height(error: HeightError) -> Refusal {
+    match error {
+        HeightError::Outside { .. } | HeightError::NoProjection(_) | HeightError::Unprojectable { .. } => {
+            Refusal::new(StatusCode::NOT_FOUND, error.to_string())
+        }
+        HeightError::Store(e) => e.into(),
+        HeightError::Damaged(_) => Refusal::damaged(&error),
+    }
+}
