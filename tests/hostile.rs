@@ -367,7 +367,7 @@ fn what_is_no_store_is_refused() {
     let ended = server(folder, "serve {}/store {}/store --listen 127.0.0.1:0");
     assert_failed(&ended, 1, &["both hold a scene named 'world'", "--scene"], "one name twice");
     assert_failed(&server(folder, "serve {}/store --listen here"), 2, &["--listen"], "no address");
-    assert_failed(&server(folder, "serve"), 2, &["<STORE>"], "no store");
+    assert_failed(&server(folder, "serve"), 2, &["no store to serve", "--config"], "no store");
     let ended = server(folder, &format!("health 127.0.0.1:{}", free_port()));
     assert_failed(&ended, 1, &["is the server running"], "no health");
 }

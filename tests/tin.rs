@@ -21,6 +21,7 @@ use diamantina_server::{inspect, sample};
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::path::Path;
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 /// Samples without a triangle of which a patch is asked how near they are: each takes a walk through it.
@@ -435,6 +436,17 @@ fn triangles_are_served_and_what_is_not_built_is_refused() {
         assert_eq!(status, 404, "{route}");
         assert!(String::from_utf8_lossy(&body).contains(word), "{route}: {body:?}");
     }
+    let polygon = scratch.path().join("zone.geojson");
+    std::fs::write(
+        &polygon,
+        r#"{"type":"Polygon","coordinates":[[[900,900],[1500,900],[900,1500],[900,900]]]}"#,
+    )
+    .unwrap();
+    let words = ["--name", "z", "--eye", "3", "--coordinates", "frame", "--polygon"];
+    let output =
+        Command::new(&programs().server).arg("zone").arg(&stores[1]).args(words).arg(&polygon).output();
+    let said = String::from_utf8(output.unwrap().stderr).unwrap();
+    assert!(said.contains("terrain has no points") && said.contains("--encoding points"), "{said}");
     // The same ground, with the same errors, whatever else is in the store.
     let alone = Store::open(&stores[1]).unwrap();
     assert_eq!(alone.scene().layers[0].tin, layer.tin);

@@ -346,6 +346,10 @@ impl Viewer {
             self.marks.clear();
             self.message = None;
         }
+        let is_quit = |event: &Event| matches!(event, Event::Key { key: Key::Q, pressed: true, modifiers, .. } if modifiers.command);
+        if ui.input(|input| input.events.iter().any(is_quit)) {
+            self.asks.push(Ask::Quit);
+        }
         if ui.input(|input| input.events.iter().any(|event| matches!(event, Event::Copy))) {
             self.asks.push(Ask::Copy(self.address()));
         }

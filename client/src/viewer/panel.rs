@@ -245,6 +245,7 @@ fn keys(ui: &mut Ui) {
         ("arrows", "look around"),
         ("H, N, F", "home, north, whole scene"),
         ("P, Tab, Esc", "picture, panel, clear"),
+        ("Ctrl+C, Ctrl+Q", "copy the view, quit"),
     ] {
         ui.horizontal_wrapped(|ui| {
             ui.label(RichText::new(what).small().strong());

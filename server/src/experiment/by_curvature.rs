@@ -151,7 +151,7 @@ fn eye(run: &Run<'_>, field: &Field) -> Eye {
     let [low, high] = field.range();
     let ground = Some(field.at([x, y])).filter(|h| !h.is_nan()).unwrap_or(low.midpoint(high));
     let at = [f64::from(x), f64::from(y)];
-    Eye { at, height: ground + run.options.eye, towards: [0.5 * side, 0.55 * side] }
+    Eye { at, height: ground + run.options.eye, towards: [0.5 * side, 0.55 * side], rise: 0.0 }
 }
 
 fn full_polygons(field: &Field) -> f64 {

@@ -70,7 +70,10 @@ pub fn lines(
         mesh.label_style(("sans-serif", 13)).draw().map_err(|e| failed(&e))?;
         for (i, (name, points)) in series.iter().enumerate() {
             let colour = Palette99::pick(i).to_rgba();
-            let line = LineSeries::new(points.iter().copied(), colour.stroke_width(2));
+            // Dense lines may lie upon each other: the first are the widest, and show at the edges of the others.
+            let over = u32::try_from(series.len() - 1 - i).unwrap_or(0).min(2);
+            let width = if points.len() > DOTTED_MAX { 1 + 3 * over } else { 2 };
+            let line = LineSeries::new(points.iter().copied(), colour.stroke_width(width));
             chart.draw_series(line).map_err(|e| failed(&e))?;
             let y = 60 + 22 * i32::try_from(i).unwrap_or(i32::MAX / 22 - 60);
             let stroke = PathElement::new([(0, y), (22, y)], colour.stroke_width(3));

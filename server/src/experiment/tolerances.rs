@@ -108,7 +108,7 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     if !run.options.points.is_empty() {
         tables.push(numbers_table(run)?);
     }
-    let pictures = vec![savings_plot(run, &found, strategies[0])?];
+    let pictures = vec![savings_plot(run, &found)?];
     let notes = vec![
         format!(
             "{} windows of {} x {} samples; criterion {:?}; tolerances in percent of each window's \
@@ -312,29 +312,29 @@ fn savings_table(run: &Run<'_>, found: &BTreeMap<(usize, Strategy), Vec<Outcome>
     table
 }
 
+/// The savings that are of interest: of sparse points of their own closure, as the paper has it; and of compact ones of the
+/// smallest quadtree. (Of a compact bitree both quadtrees are the same.)
 fn savings_plot(
     run: &Run<'_>,
     found: &BTreeMap<(usize, Strategy), Vec<Outcome>>,
-    strategy: Strategy,
 ) -> Result<Picture, ExperimentError> {
-    let names = [
-        "points, closed",
-        "triangles, closed",
-        "references, closed",
-        "points, own",
-        "triangles, own",
-        "references, own",
-    ];
-    let mut series: Vec<plot::Series> =
-        names.iter().map(|n| plot::Series { name: (*n).to_owned(), points: Vec::new() }).collect();
-    for ((i, _), list) in found.iter().filter(|((_, s), _)| *s == strategy) {
-        for (line, [mean, _]) in series.iter_mut().zip(savings(list)) {
-            line.points.push([run.options.tolerances[*i], mean]);
+    let mut series = Vec::new();
+    for (strategy, quadtree, columns) in [
+        (Strategy::Sparse, "closed", [0, 1, 2]),
+        (Strategy::Compact, "own", [3, 4, 5]),
+        (Strategy::Direct, "closed", [0, 1, 2]),
+    ] {
+        for (column, what) in columns.into_iter().zip(["points", "triangles", "references"]) {
+            let lists = found.iter().filter(|((_, s), _)| *s == strategy);
+            let points = lists.map(|((i, _), list)| [run.options.tolerances[*i], savings(list)[column][0]]);
+            let points: Vec<[f64; 2]> = points.collect();
+            if !points.is_empty() {
+                series.push(plot::Series { name: format!("{what}, {strategy} of {quadtree}"), points });
+            }
         }
     }
     let axes = ["tolerance [% of relief]", "saved [%]"];
-    let title = format!("Saved by the bitree ({strategy}) of the restricted quadtree's");
-    let bytes = plot::lines(&title, axes, false, &series)?;
+    let bytes = plot::lines("Saved by the bitree of the restricted quadtree's", axes, false, &series)?;
     let caption = "Mean savings of points to transmit, triangles and strip references.".to_owned();
     Ok(Picture { file: "savings.svg".to_owned(), caption, bytes })
 }

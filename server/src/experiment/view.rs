@@ -16,6 +16,8 @@ pub struct Eye {
     pub height: f64,
     /// Samples from the south-west corner of what is in the middle of the picture.
     pub towards: [f64; 2],
+    /// Metres up for a metre ahead, in the middle of the picture. Uprights stay upright, as with a shifted lens.
+    pub rise: f64,
 }
 
 /// A picture in shades of grey, rows from the top.
@@ -93,7 +95,7 @@ fn draw_column(field: &Field, heights: &[f64], eye: Eye, ray: [f64; 2], column: 
     while depth < far && filled > 0 {
         let place = [0, 1].map(|i| eye.at[i] + ray[i] * depth / field.cell()[i]);
         if let Some((h, slope, slot)) = sample(field, heights, place) {
-            let row = 0.5 * height as f64 - focal * (h - eye.height) / depth;
+            let row = 0.5 * height as f64 - focal * ((h - eye.height) / depth - eye.rise);
             #[allow(
                 clippy::cast_possible_truncation,
                 clippy::cast_sign_loss,
@@ -189,7 +191,22 @@ mod tests {
     use super::*;
 
     fn eye() -> Eye {
-        Eye { at: [16.0, 1.0], height: 40.0, towards: [16.0, 32.0] }
+        Eye { at: [16.0, 1.0], height: 40.0, towards: [16.0, 32.0], rise: 0.0 }
+    }
+
+    #[test]
+    fn a_rise_moves_the_picture_down() {
+        let mut heights = vec![0.0; 33 * 33];
+        heights[30 * 33..31 * 33].fill(400.0);
+        let field = Field::new(5, heights, [30.0, 30.0]).unwrap();
+        let sky = |rise: f64| {
+            let view = render(&field, field.heights(), Eye { rise, ..eye() });
+            (0..SIZE[1]).take_while(|y| view.pixels[y * SIZE[0] + SIZE[0] / 2] == 235).count()
+        };
+        let focal = SIZE[0] as f64 / (2.0 * HALF_ANGLE);
+        assert!(sky(0.0) < SIZE[1] / 2, "above the horizon");
+        let moved = sky(0.2) as f64 - sky(0.0) as f64;
+        assert!((moved - 0.2 * focal).abs() <= 1.0, "{moved}");
     }
 
     #[test]

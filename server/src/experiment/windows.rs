@@ -111,7 +111,7 @@ pub(super) fn read(
             return Err(bad("--at", &expected, format!("{x},{y}")));
         }
         let mask = mask.map(|m| open_mask(m, ingest, &source)).transpose()?;
-        let places = places(&source, options, cells);
+        let (places, before) = (places(&source, options, cells), windows.len());
         progress.stage("reading windows", "windows", places.len() as u64, 0);
         for at in places {
             if progress.is_stopping() {
@@ -126,13 +126,13 @@ pub(super) fn read(
             windows.push(Window { source: name.clone(), at, origin, crs: grid.frame_crs(), field, weights });
         }
         source.check_nodata()?;
+        if options.windows == Rule::One && windows.len() == before {
+            return Err(bad("--at", "a window with data in it", format!("none there in {name}")));
+        }
     }
     if windows.is_empty() {
         let names = sources.iter().map(|path| file_name(path)).collect::<Vec<_>>().join(", ");
-        return Err(match options.windows {
-            Rule::One => bad("--at", "a window with data in it", format!("none there in {names}")),
-            _ => bad("--windows", "at least one window that fits the rule", format!("none in {names}")),
-        });
+        return Err(bad("--windows", "at least one window that fits the rule", format!("none in {names}")));
     }
     Ok(windows)
 }

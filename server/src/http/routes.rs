@@ -206,7 +206,7 @@ fn points(layer: &Layer) -> Result<Encoding, Refusal> {
     if !layer.encodings.iter().any(|e| e == "points") {
         return Err(Refusal::new(
             StatusCode::NOT_FOUND,
-            "this layer has no points, only what its encodings list",
+            "this layer has no points, only what its encodings list: build it with --encoding points,tin",
         ));
     }
     Ok(Encoding { forest: layer.forest, payload: Kind::Points, page: Kind::Index, letters: ["p", "i"] })

@@ -382,6 +382,11 @@ fn read(store: &Store, progress: &Progress) -> Result<Vec<Ground>, ZoneError> {
     progress.stage("read", "layers", layers.len() as u64, 0);
     let mut grounds = Vec::with_capacity(layers.len());
     for (number, layer) in layers.iter().enumerate() {
+        // Rays are cast over samples, which triangles have not.
+        if !layer.encodings.iter().any(|name| name == "points") {
+            let (layer, has) = (layer.name.clone(), layer.encodings.clone());
+            return Err(InspectError::NoEncoding { layer, has }.into());
+        }
         let relief = Relief::read(store, u8::try_from(number).unwrap_or(u8::MAX), layer)?;
         let Layer { origin, cell, quantum, height_offset, .. } = layer;
         grounds.push(Ground {

@@ -102,6 +102,13 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
             done => done?,
         }
     }
+    if table.rows.is_empty() {
+        return Err(ExperimentError::Options {
+            option: "--polygon",
+            expected: "a region, as no window has a lake".to_owned(),
+            found: format!("none for {} windows", run.windows.len()),
+        });
+    }
     notes.extend([
         format!(
             "Eyes stand {} m above the highest ground of their polygon. The bitree's selection is {}, criterion \

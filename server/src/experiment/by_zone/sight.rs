@@ -113,7 +113,11 @@ impl<'a> Sight<'a> {
         let known = (0..field.heights().len()).filter(|slot| !field.heights()[*slot].is_nan());
         let highest = known.max_by(|a, b| field.heights()[*a].total_cmp(&field.heights()[*b])).unwrap_or(0);
         let towards = field.point(highest).map(f64::from);
-        let looker = view::Eye { at: eye.place, height: eye.height * QUANTUM, towards };
+        let height = eye.height * QUANTUM;
+        let [dx, dy] = [0, 1].map(|i| (towards[i] - eye.place[i]) * field.cell()[i]);
+        let rise = (field.heights()[highest] - height) / dx.hypot(dy).max(f64::MIN_POSITIVE);
+        let rise = if rise.is_finite() { rise.clamp(-1.0, 1.0) } else { 0.0 };
+        let looker = view::Eye { at: eye.place, height, towards, rise };
         let drawn = |bytes: Result<Vec<u8>, png::EncodingError>| {
             bytes.map_err(|e| ExperimentError::Plot(e.to_string()))
         };
