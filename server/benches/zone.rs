@@ -1,5 +1,5 @@
 //! What a zone costs over 4097 x 4097 samples of the made landscape: one eye looking all around, and whole masks of
-//! 200 eyes, each cast once: around a bay, and around a disc with a summit, at whose height nearly all is seen.
+//! 200 eyes, each cast once: around a bay, and around a disc with a summit, whose height eyes stand at and see far from.
 #![allow(clippy::cast_possible_truncation, reason = "heights below 4000 m in decimetres")]
 
 use criterion::{Criterion, Throughput};
