@@ -2,7 +2,7 @@
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .NOTPARALLEL:
-.PHONY: help demo test check contract bench bench-link bench-peers bench-serve bench-wasm setup fmt clippy tests doc deny wasm scripts
+.PHONY: help demo test test-long check contract bench bench-link bench-peers bench-serve bench-wasm setup fmt clippy tests doc deny wasm scripts
 
 # Mesa's device selection complains where there is no desktop session; there is nothing to select.
 export NODEVICE_SELECT := 1
@@ -17,6 +17,7 @@ help:
 	@echo "make bench   benchmarks, with a table at the end"
 	@echo "make bench-link    seconds to a view over slow links, on the DEMs of DIAMANTINA_DATA"
 	@echo "make bench-serve   requests a second beside nginx, where it and wrk are installed"
+	@echo "make test-long     the tests that take too long for each change: every DEM of DIAMANTINA_DATA"
 	@echo "make bench-wasm    decoding in the browser's architecture, where it and node are installed"
 	@echo "make bench-peers   bytes, bounds and speed beside other codecs, on the DEMs of DIAMANTINA_DATA"
 
@@ -63,6 +64,10 @@ clippy:
 # With the output of tests that pass: it says which of them had no data to work on.
 tests:
 	@$(step) tests cargo test --locked --workspace --no-fail-fast -- --show-output
+
+# What takes too long for each change.
+test-long: setup
+	@$(step) long cargo test --locked -p diamantina-tests --test e2e -- --ignored --show-output
 
 # After the tests, which have built the programs.
 contract:

@@ -264,7 +264,7 @@ fn every_sample_of_real_dems_is_within_the_declared_error_and_borders_fit() {
 
 /// Minutes to an hour: as a reader asks for it, and for docs/BENCHMARKS.md.
 #[test]
-#[ignore = "takes as long as all other tests together: run it alone, with --ignored"]
+#[ignore = "builds and compares every DEM of the data: too long for each change; `make test-long` runs it"]
 fn every_sample_of_every_real_dem_is_within_the_declared_error_of_triangles() {
     let Some(folder) = data() else { return };
     let mut all = dems(&folder);

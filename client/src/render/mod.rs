@@ -208,6 +208,37 @@ pub enum RenderError {
     Read(String),
 }
 
+/// The system's graphics, as far as they are more than WebGL2.
+pub(crate) fn instance() -> wgpu::Instance {
+    let mut description = wgpu::InstanceDescriptor::new_without_display_handle();
+    description.backends = wgpu::Backends::PRIMARY;
+    wgpu::Instance::new(description)
+}
+
+/// The best adapter that there is, in software if need be, of those that draw on a surface if there is one; and a device
+/// of it.
+pub(crate) fn device(
+    instance: &wgpu::Instance,
+    surface: Option<&wgpu::Surface<'_>>,
+    label: &str,
+) -> Result<(wgpu::Adapter, wgpu::Device, wgpu::Queue), RenderError> {
+    let adapter = pollster::block_on(instance.request_adapter(&wgpu::RequestAdapterOptions {
+        power_preference: wgpu::PowerPreference::HighPerformance,
+        compatible_surface: surface,
+        ..Default::default()
+    }))
+    .map_err(|e| RenderError::NoAdapter(e.to_string()))?;
+    // No more than a browser has, so that whatever works here works there.
+    let limits = wgpu::Limits::downlevel_webgl2_defaults().using_resolution(adapter.limits());
+    let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
+        label: Some(label),
+        required_limits: limits,
+        ..Default::default()
+    }))
+    .map_err(|e| RenderError::Device(e.to_string()))?;
+    Ok((adapter, device, queue))
+}
+
 /// A diamond's place, as the vertex shader takes it.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]

@@ -1,6 +1,6 @@
 //! Pictures without a window.
 
-use super::{FrameStats, Look, Options, RenderError, Renderer};
+use super::{FrameStats, Look, Options, RenderError, Renderer, device, instance};
 use crate::camera::Camera;
 use crate::drawing::DrawItem;
 use crate::picture::Picture;
@@ -19,22 +19,7 @@ impl Offscreen {
     /// # Errors
     /// When there is no adapter, or it gives no device.
     pub fn new(options: &Options) -> Result<Self, RenderError> {
-        let mut description = wgpu::InstanceDescriptor::new_without_display_handle();
-        description.backends = wgpu::Backends::PRIMARY;
-        let instance = wgpu::Instance::new(description);
-        let adapter = pollster::block_on(instance.request_adapter(&wgpu::RequestAdapterOptions {
-            power_preference: wgpu::PowerPreference::HighPerformance,
-            ..Default::default()
-        }))
-        .map_err(|e| RenderError::NoAdapter(e.to_string()))?;
-        // No more than a browser has, so that whatever works here works there.
-        let limits = wgpu::Limits::downlevel_webgl2_defaults().using_resolution(adapter.limits());
-        let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
-            label: Some("offscreen"),
-            required_limits: limits,
-            ..Default::default()
-        }))
-        .map_err(|e| RenderError::Device(e.to_string()))?;
+        let (_, device, queue) = device(&instance(), None, "offscreen")?;
         let options = Options { format: wgpu::TextureFormat::Rgba8UnormSrgb, ..*options };
         Ok(Self { renderer: Renderer::new(device, queue, &options), target: None })
     }

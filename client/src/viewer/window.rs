@@ -77,23 +77,9 @@ impl Display {
         let attributes =
             Window::default_attributes().with_title(title).with_inner_size(PhysicalSize::<u32>::from(size));
         let window = Arc::new(events.create_window(attributes).map_err(|e| system(&e))?);
-        let mut description = wgpu::InstanceDescriptor::new_without_display_handle();
-        description.backends = wgpu::Backends::PRIMARY;
-        let instance = wgpu::Instance::new(description);
+        let instance = render::instance();
         let surface = instance.create_surface(window.clone()).map_err(|e| system(&e))?;
-        let adapter = pollster::block_on(instance.request_adapter(&wgpu::RequestAdapterOptions {
-            power_preference: wgpu::PowerPreference::HighPerformance,
-            compatible_surface: Some(&surface),
-            ..Default::default()
-        }))
-        .map_err(|e| RenderError::NoAdapter(e.to_string()))?;
-        let limits = wgpu::Limits::downlevel_webgl2_defaults().using_resolution(adapter.limits());
-        let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
-            label: Some("window"),
-            required_limits: limits,
-            ..Default::default()
-        }))
-        .map_err(|e| RenderError::Device(e.to_string()))?;
+        let (adapter, device, queue) = render::device(&instance, Some(&surface), "window")?;
         let found = window.inner_size();
         let mut configuration = surface
             .get_default_config(&adapter, found.width.max(1), found.height.max(1))
