@@ -197,7 +197,7 @@ mod tests {
     #[test]
     fn a_rise_moves_the_picture_down() {
         let mut heights = vec![0.0; 33 * 33];
-        heights[30 * 33..31 * 33].fill(400.0);
+        heights[30 * 33..31 * 33].fill(200.0);
         let field = Field::new(5, heights, [30.0, 30.0]).unwrap();
         let sky = |rise: f64| {
             let view = render(&field, field.heights(), Eye { rise, ..eye() });
