@@ -9,6 +9,8 @@
 
 /// The same input gives the same bytes, whatever the threads and the memory.
 mod determinism;
+/// What `doctor` says of servers, and of proxies before them.
+mod doctor;
 /// The papers' tables on real ground.
 mod experiments;
 /// The first view over a slow link: how soon, and never worse while the eye stands still.

@@ -345,7 +345,7 @@ fn who_asks_too_often_is_told_when_to_come_back() {
 }
 
 /// Writes a new certificate for this machine, and its key.
-fn certify(folder: &Path) -> (CertificateDer<'static>, PathBuf, PathBuf) {
+pub(crate) fn certify(folder: &Path) -> (CertificateDer<'static>, PathBuf, PathBuf) {
     let made = rcgen::generate_simple_self_signed(["localhost".to_owned()]).unwrap();
     let (certificate, key) = (folder.join("cert.pem"), folder.join("key.pem"));
     std::fs::write(&certificate, made.cert.pem()).unwrap();

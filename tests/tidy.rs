@@ -57,6 +57,7 @@ const CLIENT: &[(&str, &[&str])] = &[
     ("drawing", &["morph", "surface"]),
     ("cache", &["surface"]),
     ("fetch", &["encoding"]),
+    ("doctor", &["encoding", "fetch", "surface"]),
     ("sight", &["camera"]),
     ("cut", &["camera", "drawing", "encoding", "morph", "sight", "surface"]),
     ("terrain", &["cache", "camera", "cut", "drawing", "encoding", "fetch", "morph", "sight", "surface"]),

@@ -17,12 +17,14 @@
 //! | [`render`] | drawing + camera → pixels; the only module that knows the GPU |
 //! | [`picture`] | pixels → PNG |
 //! | [`headless`] | pictures and flights without a window |
+//! | [`doctor`] | what is wrong with a server as clients see it |
 //! | [`viewer`] | the terrain with a panel and a mouse; in a window |
 
 pub mod cache;
 pub mod camera;
 pub mod controls;
 pub mod cut;
+pub mod doctor;
 pub mod drawing;
 pub mod encoding;
 pub mod fetch;

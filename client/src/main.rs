@@ -2,6 +2,7 @@
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use diamantina_client::camera::{Camera, FOV_Y};
+use diamantina_client::doctor::{self, Verdict};
 use diamantina_client::encoding::Encoding;
 use diamantina_client::fetch::{self, FetchError};
 use diamantina_client::headless::{self, Flight, FlightPath, FrameLine, PictureReport};
@@ -40,6 +41,27 @@ enum Command {
     Fly(FlyArgs),
     /// Look around in a window
     View(ViewerArgs),
+    /// Tell what is wrong with a server, as clients see it through all the proxies and caches before it
+    Doctor(DoctorArgs),
+}
+
+/// What a private scene asks for.
+#[derive(Args, Clone)]
+struct TokenArgs {
+    /// Show this to the server, for private scenes. Others of this machine can read arguments: rather set the variable
+    #[arg(long, env = "DIAMANTINA_TOKEN", hide_env_values = true, value_name = "TOKEN")]
+    token: Option<String>,
+}
+
+#[derive(Args)]
+struct DoctorArgs {
+    /// The server, or one of its scenes: http://HOST:PORT or http://HOST:PORT/scenes/NAME
+    url: String,
+    #[command(flatten)]
+    token: TokenArgs,
+    /// Write what was found here, one JSON object a line (- for standard output)
+    #[arg(long, value_name = "JSON")]
+    json: Option<PathBuf>,
 }
 
 #[derive(Args)]
@@ -56,6 +78,8 @@ struct ViewArgs {
     /// The server, or one of its scenes: http://HOST:PORT or http://HOST:PORT/scenes/NAME; for `view` also with
     /// #x,y,z,heading,pitch
     url: String,
+    #[command(flatten)]
+    token: TokenArgs,
     /// Width and height of the picture, in pixels
     #[arg(long, default_value = "1380x768", value_name = "WIDTHxHEIGHT", value_parser = parse_size)]
     size: [u32; 2],
@@ -248,6 +272,7 @@ fn main() -> ExitCode {
         Command::Render(args) => render(&args),
         Command::Fly(args) => fly(&args),
         Command::View(args) => view(&args),
+        Command::Doctor(args) => doctor(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -286,7 +311,11 @@ impl ViewArgs {
             memory_bytes: self.memory << 20,
             sight: Sight { vertical: !self.sphere_error, foveation: self.foveation },
             morph_seconds,
-            fetch: fetch::Options { encoding, ..fetch::Options::default() },
+            fetch: fetch::Options {
+                encoding,
+                token: self.token.token.as_deref().map(Into::into),
+                ..fetch::Options::default()
+            },
             zone: self.zone.clone(),
             ..terrain::Options::default()
         };
@@ -427,6 +456,43 @@ fn view(args: &ViewerArgs) -> Result<(), Failure> {
     let title = format!("{} - Diamantina", terrain.scene().name);
     let viewer = Viewer::new(terrain, &url, look, view.size, at);
     viewer::window::run(viewer, &title, &view.options()).map_err(|e| Failure(1, e.to_string()))
+}
+
+fn doctor(args: &DoctorArgs) -> Result<(), Failure> {
+    let mut json = args.json.as_deref().map(headless::open_text).transpose()?;
+    let is_quiet = args.json.as_ref().is_some_and(|path| path.as_os_str() == "-");
+    let (mut counts, mut failed) = ([0u32; 3], None);
+    let told = doctor::examine(&args.url, args.token.token.as_deref(), |finding| {
+        counts[finding.verdict as usize] += 1;
+        let mut write = || -> std::io::Result<()> {
+            if let Some(out) = &mut json {
+                writeln!(out, "{}", serde_json::to_string(&finding)?)?;
+            }
+            if !is_quiet {
+                let mut out = std::io::stdout().lock();
+                writeln!(out, "{:8} {:18} {}", finding.verdict, finding.check, finding.found)?;
+                if let Some(remedy) = finding.remedy {
+                    writeln!(out, "{:27} {remedy}", "")?;
+                }
+            }
+            Ok(())
+        };
+        if let Err(error) = write() {
+            failed.get_or_insert(error);
+        }
+    });
+    told.map_err(|e| Failure(if matches!(e, FetchError::Address { .. }) { 2 } else { 1 }, e.to_string()))?;
+    if let Some(out) = &mut json {
+        shown(out.flush())?;
+    }
+    if let Some(error) = failed {
+        shown(Err(error))?;
+    }
+    match counts[Verdict::Bad as usize] {
+        0 => Ok(()),
+        1 => Err(Failure(1, "one thing does not work".to_owned())),
+        n => Err(Failure(1, format!("{n} things do not work"))),
+    }
 }
 
 fn fly(args: &FlyArgs) -> Result<(), Failure> {

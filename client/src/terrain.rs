@@ -290,7 +290,7 @@ impl Terrain {
             return Err(TerrainError::Still);
         }
         let opened = Instant::now();
-        let (fetcher, scene) = Fetcher::open(url, options.fetch)?;
+        let (fetcher, scene) = Fetcher::open(url, &options.fetch)?;
         let encoding = options.fetch.encoding;
         if let Some(layer) = scene.layers.iter().find(|layer| encoding.layer(layer).is_none()) {
             return Err(TerrainError::Encoding {

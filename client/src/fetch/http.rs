@@ -3,7 +3,8 @@
 use super::{FetchError, TRIES_MAX, Traffic};
 use bytes::Bytes;
 use diamantina_protocol::bintree::Forest;
-use diamantina_protocol::index;
+use diamantina_protocol::diamond::Diamond;
+use diamantina_protocol::index::{self, Entry};
 use diamantina_protocol::message::{self, Catalogue, Layer, Scene};
 use diamantina_protocol::zone::{self, Mask};
 use reqwest::{Client, Response, StatusCode, Url};
@@ -30,11 +31,11 @@ const ZONE_BYTES_MAX: usize = 16 << 20;
 pub const LAYERS_MAX: usize = 64;
 
 /// The base of an address, and the scene that it names.
-pub(super) fn parse_address(text: &str) -> Result<(Url, Option<String>), FetchError> {
+pub(crate) fn parse_address(text: &str) -> Result<(Url, Option<String>), FetchError> {
     let wrong = |reason: &str| FetchError::Address { url: text.to_owned(), reason: reason.to_owned() };
     let mut url = Url::parse(text).map_err(|e| wrong(&e.to_string()))?;
-    if url.scheme() != "http" {
-        return Err(wrong("this build speaks http only"));
+    if !matches!(url.scheme(), "http" | "https") {
+        return Err(wrong("it is neither http nor https"));
     }
     if url.host_str().is_none() {
         return Err(wrong("it has no host"));
@@ -54,7 +55,7 @@ pub(super) fn parse_address(text: &str) -> Result<(Url, Option<String>), FetchEr
 }
 
 /// Why a scene cannot be shown, if so: it comes from outside.
-fn check(scene: &Scene) -> Result<(), String> {
+pub(crate) fn check(scene: &Scene) -> Result<(), String> {
     if scene.layers.is_empty() || scene.layers.len() > LAYERS_MAX {
         return Err(format!("{} layers, expected 1 to {LAYERS_MAX}", scene.layers.len()));
     }
@@ -243,8 +244,19 @@ fn only(mut catalogue: Catalogue) -> Result<Scene, FetchError> {
     }
 }
 
+/// The entries of a page of the index, as it comes over the wire. Decompression stops at a limit, whatever the bytes
+/// claim to become.
+pub(crate) fn decode_page(
+    forest: &Forest,
+    number: u32,
+    blob: &[u8],
+) -> Result<Vec<(Diamond, Entry)>, FetchError> {
+    let page = zstd::bulk::decompress(blob, PAGE_BYTES_MAX).map_err(|_| FetchError::Compression(number))?;
+    Ok(index::decode(forest, number, &page)?)
+}
+
 /// The error with its causes: the outermost one alone says nothing.
-fn transport(error: &reqwest::Error) -> FetchError {
+pub(crate) fn transport(error: &reqwest::Error) -> FetchError {
     let mut text = error.to_string();
     let mut cause = std::error::Error::source(error);
     while let Some(next) = cause {
@@ -280,8 +292,12 @@ mod tests {
         assert_eq!(parse("http://h:8080").unwrap(), at("http://h:8080/", None));
         assert_eq!(parse("http://h/scenes").unwrap(), at("http://h/", None));
         assert_eq!(parse("http://h/scenes/alps/").unwrap(), at("http://h/", Some("alps")));
+        assert_eq!(
+            parse("https://h/scenes/alps").unwrap(),
+            ("https://h/".to_owned(), Some("alps".to_owned()))
+        );
         assert_eq!(parse("http://h/deep/scenes/alps?x#y").unwrap(), at("http://h/deep", Some("alps")));
-        for bad in ["", "h:80", "ftp://h/", "https://h/", "http://h/scenes/a/b/c", "http://h/scenes/.x"] {
+        for bad in ["", "h:80", "ftp://h/", "http://h/scenes/a/b/c", "http://h/scenes/.x"] {
             assert!(matches!(parse(bad), Err(FetchError::Address { .. })), "{bad}");
         }
     }

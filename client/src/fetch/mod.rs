@@ -13,6 +13,7 @@
 //!
 //! | module | what it holds |
 //! |---|---|
+//! | `connect` | how a server is reached: encryption, proxies, tokens |
 //! | `http` | addresses, answers and their limits, what goes over the wire |
 //! | `tasks` | the wishes and the tasks that fulfil them |
 //! | `stream` | what comes without being wished for, and when it ends |
@@ -20,6 +21,7 @@
 //! | `error` | why something was not fetched |
 
 mod batch;
+pub(crate) mod connect;
 mod error;
 mod http;
 mod stream;
@@ -31,6 +33,7 @@ mod tests;
 pub use batch::ROOT_BYTES;
 pub use error::FetchError;
 pub use http::LAYERS_MAX;
+pub(crate) use http::{check as check_scene, decode_page, parse_address, transport};
 
 use crate::encoding::Encoding;
 use bytes::Bytes;
@@ -39,8 +42,7 @@ use diamantina_protocol::index::Entry;
 use diamantina_protocol::message::{Scene, StreamAsk, scene_route};
 use diamantina_protocol::zone::Mask;
 use foldhash::fast::RandomState;
-use http::{Counters, Http, parse_address};
-use reqwest::Client;
+use http::{Counters, Http};
 use std::collections::HashSet;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, mpsc};
@@ -64,7 +66,7 @@ pub const REST: Duration = Duration::from_secs(20);
 const FAILURES_MAX: usize = 4 * WISHES_MAX;
 
 /// How to fetch.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Options {
     /// Requests in flight at once, 1 to 64; of them, half at most are for diamonds.
     pub requests_max: usize,
@@ -72,11 +74,14 @@ pub struct Options {
     pub patience: Duration,
     /// How diamonds are encoded.
     pub encoding: Encoding,
+    /// Shown with each request, for private scenes.
+    pub token: Option<Arc<str>>,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { requests_max: 8, patience: Duration::from_secs(15), encoding: Encoding::default() }
+        let encoding = Encoding::default();
+        Self { requests_max: 8, patience: Duration::from_secs(15), encoding, token: None }
     }
 }
 
@@ -154,12 +159,12 @@ pub struct Fetcher {
 
 impl Fetcher {
     /// Reads the scene's description, waiting for it, and starts. `url` is that of a scene,
-    /// `http://HOST:PORT/scenes/NAME`, or of a server with only one. Layers that are offered in the encoding asked for
+    /// `http://HOST:PORT/scenes/NAME` (or https), or of a server with only one. Layers that are offered in the encoding asked for
     /// come as they are streamed in it: see [`Encoding::layer`].
     ///
     /// # Errors
     /// When there is no such scene, or it cannot be shown.
-    pub fn open(url: &str, options: Options) -> Result<(Self, Scene), FetchError> {
+    pub fn open(url: &str, options: &Options) -> Result<(Self, Scene), FetchError> {
         let (base, name) = parse_address(url)?;
         let start = |e: &dyn std::fmt::Display| FetchError::Start(e.to_string());
         let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -168,11 +173,8 @@ impl Fetcher {
             .enable_all()
             .build()
             .map_err(|e| start(&e))?;
-        let local = matches!(base.host_str(), Some("localhost" | "127.0.0.1" | "[::1]"));
-        let builder = Client::builder().connect_timeout(options.patience).read_timeout(options.patience);
-        let builder = if local { builder.no_proxy() } else { builder };
         let http = Http {
-            client: builder.build().map_err(|e| start(&e))?,
+            client: connect::client(&base, options.patience, options.token.as_deref())?,
             base: base.as_str().trim_end_matches('/').to_owned(),
             traffic: Counters::default(),
         };

@@ -6,13 +6,13 @@
 //! would come twice.
 
 use super::batch::Frames;
-use super::http::{PAGE_BYTES_MAX, shortened};
+use super::http::{decode_page, shortened};
 use super::tasks::Shared;
 use super::{Event, FetchError, Key};
 use bytes::Bytes;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
-use diamantina_protocol::index::{self, Entry};
+use diamantina_protocol::index::Entry;
 use diamantina_protocol::message::{self, FrameHeader, STREAM_MAX, Status, StreamAsk};
 use foldhash::fast::RandomState;
 use std::collections::HashSet;
@@ -42,10 +42,7 @@ impl Ledger {
                 if centre[1] != 0 || self.pages.len() == STREAM_MAX || !self.pages.insert(number) {
                     return Err(FetchError::Unasked(centre));
                 }
-                // Stops at the limit, whatever the bytes claim to become.
-                let page = zstd::bulk::decompress(blob, PAGE_BYTES_MAX)
-                    .map_err(|_| FetchError::Compression(number))?;
-                Ok(Entered::Page(number, index::decode(&self.forest, number, &page)?))
+                Ok(Entered::Page(number, decode_page(&self.forest, number, blob)?))
             }
             Status::Ok => {
                 let d = self.forest.diamond(centre).ok_or(FetchError::Unasked(centre))?;
@@ -117,6 +114,7 @@ pub(super) fn weight(event: &Event) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use diamantina_protocol::index;
     use crate::world::world;
 
     fn ledger() -> Ledger {

@@ -1,14 +1,13 @@
 //! The wishes, and the tasks that fulfil them: each takes the most urgent that nobody is fetching.
 
 use super::batch::{Batch, Frames};
-use super::http::{Http, PAGE_BYTES_MAX, count, pause, shortened};
+use super::http::{Http, PAGE_BYTES_MAX, count, decode_page, pause, shortened};
 use super::stream::weight;
 use super::{Event, FetchError, Key, REST, TRIES_MAX, Want};
 use crate::encoding::Encoding;
 use bytes::Bytes;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
-use diamantina_protocol::index;
 use diamantina_protocol::message::{self, FrameHeader, Scene, Status, StreamAsk};
 use foldhash::fast::RandomState;
 use std::collections::{HashMap, VecDeque};
@@ -215,10 +214,7 @@ impl Shared {
                 let layer_of = &layers[*layer];
                 let route = self.encoding.index_route(&self.scene, *layer, *number);
                 let body = self.http.whole(&route, PAGE_BYTES_MAX).await?;
-                // Stops at the limit, whatever the bytes claim to become.
-                let page = zstd::bulk::decompress(&body, PAGE_BYTES_MAX)
-                    .map_err(|_| FetchError::Compression(*number))?;
-                let entries = index::decode(&layer_of.forest, *number, &page)?;
+                let entries = decode_page(&layer_of.forest, *number, &body)?;
                 self.deliver(Key::Page(*layer, *number), Event::Page(*layer, *number, entries));
                 Ok(())
             }

@@ -29,7 +29,7 @@ fn events(fetcher: &mut Fetcher, count: usize) -> Vec<Event> {
 #[test]
 fn what_arrived_is_not_fetched_again_until_it_is_wished_for_knowingly() {
     let served = Served::start(1, Faults::default());
-    let (mut fetcher, _) = Fetcher::open(&served.url, Options::default()).unwrap();
+    let (mut fetcher, _) = Fetcher::open(&served.url, &Options::default()).unwrap();
     let wants = wants(4);
     fetcher.wish(wants.clone());
     // Wishes by an author who has not looked at the arrivals yet.
@@ -52,7 +52,7 @@ fn what_arrived_is_not_fetched_again_until_it_is_wished_for_knowingly() {
 #[test]
 fn requests_that_nobody_wants_any_more_are_dropped() {
     let served = Served::start(1, Faults { slow: 1.0, ..Faults::default() });
-    let (mut fetcher, _) = Fetcher::open(&served.url, Options::default()).unwrap();
+    let (mut fetcher, _) = Fetcher::open(&served.url, &Options::default()).unwrap();
     fetcher.wish(wants(9));
     std::thread::sleep(Duration::from_millis(200));
     let flights = fetcher.shared.lock().flights.len();
@@ -77,7 +77,7 @@ fn of_eight_requests_half_may_be_for_diamonds_and_one_is() {
     {
         // Silent, so that what was sent stays in flight.
         let served = Served::start(1, Faults::default());
-        let (mut fetcher, _) = Fetcher::open(&served.url, Options::default()).unwrap();
+        let (mut fetcher, _) = Fetcher::open(&served.url, &Options::default()).unwrap();
         served.misbehave(Faults { silent: 1.0, ..Faults::default() });
         fetcher.wish(wishes);
         let until = Instant::now() + Duration::from_secs(20);
@@ -93,7 +93,7 @@ fn of_eight_requests_half_may_be_for_diamonds_and_one_is() {
 #[test]
 fn batches_stay_within_their_limits() {
     let served = Served::start(1, Faults::default());
-    let (mut fetcher, _) = Fetcher::open(&served.url, Options::default()).unwrap();
+    let (mut fetcher, _) = Fetcher::open(&served.url, &Options::default()).unwrap();
     // The server of the tests panics, and so answers nothing, where a batch is too long.
     let wants = wants(9);
     fetcher.wish(wants.clone());
@@ -106,7 +106,7 @@ fn batches_stay_within_their_limits() {
 #[test]
 fn a_wish_that_keeps_failing_is_reported_and_rests() {
     let served = Served::start(1, Faults { status_500: 1.0, ..Faults::default() });
-    let (mut fetcher, _) = Fetcher::open(&served.url, Options::default()).unwrap();
+    let (mut fetcher, _) = Fetcher::open(&served.url, &Options::default()).unwrap();
     fetcher.wish(vec![wants(4)[0], Want { key: Key::Page(0, 0), bytes: None }]);
     let reported = events(&mut fetcher, 2);
     assert!(reported.iter().all(|event| matches!(event, Event::Failed(..))), "{reported:?}");
@@ -118,7 +118,7 @@ fn a_wish_that_keeps_failing_is_reported_and_rests() {
 #[test]
 fn a_page_that_is_a_bomb_is_refused() {
     let served = Served::start(1, Faults { bomb: 1.0, ..Faults::default() });
-    let (mut fetcher, _) = Fetcher::open(&served.url, Options::default()).unwrap();
+    let (mut fetcher, _) = Fetcher::open(&served.url, &Options::default()).unwrap();
     fetcher.wish(vec![Want { key: Key::Page(0, 0), bytes: None }]);
     let reported = events(&mut fetcher, 1);
     let [Event::Failed(Key::Page(0, 0), error)] = reported.as_slice() else { panic!("{reported:?}") };
@@ -127,6 +127,6 @@ fn a_page_that_is_a_bomb_is_refused() {
 
 #[test]
 fn no_server_is_said_plainly() {
-    let error = Fetcher::open("http://127.0.0.1:9", Options::default()).unwrap_err().to_string();
+    let error = Fetcher::open("http://127.0.0.1:9", &Options::default()).unwrap_err().to_string();
     assert!(error.contains("is the server running"), "{error}");
 }

@@ -1,6 +1,7 @@
 //! What a receiver has after each part of a progressive transmission: errors against points and bytes.
 //!
-//! Heights are whole units (1 m where all are whole metres, else 1 cm), and every scheme ends with exactly those.
+//! Heights are whole units (1 m where all are whole metres, else 1 cm; ten, a hundred... times that where heights are
+//! beyond the 2^23 units that a source may have), and every scheme ends with exactly those.
 //!
 //! | scheme | order | bytes |
 //! |---|---|---|
@@ -106,14 +107,19 @@ fn schemes(window: &Window) -> Result<Vec<Scheme>, ExperimentError> {
 
 /// The field with heights of whole units, and the unit in metres.
 fn whole_units(field: &Field) -> (Field, f64) {
-    let unit = if field.heights().iter().all(|h| h.is_nan() || h.fract() == 0.0) { 1.0 } else { 0.01 };
+    let known = || field.heights().iter().filter(|h| !h.is_nan());
+    let mut unit = if known().all(|h| h.fract() == 0.0) { 1.0 } else { 0.01 };
+    let largest = known().fold(0.0f64, |most, h| most.max(h.abs()));
+    while (largest / unit).round() > f64::from(points::SOURCE_MAX) {
+        unit *= 10.0;
+    }
     let heights = field.heights().iter().map(|h| (h / unit).round()).collect();
     (Field::new(field.log2(), heights, field.cell()).unwrap_or_else(|| field.clone()), unit)
 }
 
 /// Heights as integers; the field has whole units.
 fn units(field: &Field) -> Vec<i32> {
-    #[allow(clippy::cast_possible_truncation, reason = "heights of terrain, in centimetres at most")]
+    #[allow(clippy::cast_possible_truncation, reason = "at most SOURCE_MAX")]
     field.heights().iter().map(|h| if h.is_nan() { NODATA } else { *h as i32 }).collect()
 }
 
@@ -192,7 +198,7 @@ fn batch(field: &Field, before: &Bitree, after: &Bitree) -> Vec<u8> {
         let around = before.around(p).into_iter().flatten().next();
         let deduced =
             around.map_or(0.0, |facet| f64::midpoint(facet.heights()[0], facet.heights()[2]).round());
-        #[allow(clippy::cast_possible_truncation, reason = "heights of terrain, in centimetres at most")]
+        #[allow(clippy::cast_possible_truncation, reason = "at most twice SOURCE_MAX")]
         let difference = (height - deduced).round() as i64;
         varint(&mut gaps, at - last);
         varint(&mut differences, ((difference << 1) ^ (difference >> 63)).cast_unsigned());
@@ -321,7 +327,10 @@ mod tests {
             field,
             weights: None,
         };
-        for (name, steps) in schemes(&window).unwrap() {
+        // A height beyond 2^23 makes the unit ten metres.
+        let high = window.field.heights().iter().map(|h| h * 1e5).collect();
+        let high = Window { field: Field::new(5, high, [30.0, 30.0]).unwrap(), ..window.clone() };
+        for (name, steps) in schemes(&window).unwrap().into_iter().chain(schemes(&high).unwrap()) {
             assert_eq!(steps.last().unwrap().max, 0.0, "{name}");
             assert!(
                 steps.windows(2).all(|w| w[0].points <= w[1].points && w[0].bytes <= w[1].bytes),

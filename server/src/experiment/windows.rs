@@ -51,7 +51,7 @@ pub(super) fn parse_place(text: &str) -> Result<Point, String> {
 }
 
 /// A field and where it is from.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Window {
     /// File name of its DEM.
     pub source: String,
@@ -173,6 +173,25 @@ fn open_mask(path: &Path, ingest: &ingest::Options, source: &Source) -> Result<S
             option: "--mask",
             expected: format!("the DEM's own grid, {}", size(source)),
             found: format!("{} in {}", size(&mask), path.display()),
+        });
+    }
+    // Weights of another place would be taken for those of this one. A raster that says not where it lies is believed.
+    let [own, given] = [source, &mask].map(Source::grid);
+    let says_where = given.crs.is_some() || given.origin != [0.0; 2];
+    let is_there = (0..2).all(|k| {
+        let [apart, coarser] = [given.origin[k] - own.origin[k], given.cell[k] - own.cell[k]];
+        apart.abs() <= 0.01 * own.cell[k]
+            && coarser.abs() * f64::from(own.width.max(own.height)) <= own.cell[k]
+    });
+    if says_where && !is_there {
+        let place = |grid: &ingest::Grid| {
+            let ([x, y], [dx, dy]) = (grid.origin, grid.cell);
+            format!("the south-west sample at {x:.2}, {y:.2}, {dx:.4} x {dy:.4} m a cell")
+        };
+        return Err(ExperimentError::Options {
+            option: "--mask",
+            expected: format!("the DEM's own grid, {}", place(own)),
+            found: format!("{} in {}", place(given), path.display()),
         });
     }
     Ok(mask)

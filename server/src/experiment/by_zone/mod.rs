@@ -14,9 +14,9 @@ use super::by_curvature::with_share;
 use super::curvature::quadtree::{Quadtree, Sums};
 use super::curvature::templates;
 use super::report::{Picture, Report, Table};
-use super::select::{Ground as Weighed, Strategy, by_strategy, scale};
+use super::select::{Ground as Weighed, scale, select};
 use super::windows::Window;
-use super::{Criterion, ExperimentError, Run, scan, view};
+use super::{ExperimentError, Run, scan, view};
 use crate::zone::cast::{Optics, cast};
 use crate::zone::polygon::Coordinates;
 use crate::zone::{ANGLE, EPSILON, HIDDEN};
@@ -53,10 +53,11 @@ pub(crate) struct Options {
     pub(crate) spacing: Option<f64>,
 }
 
-const COLUMNS: [&str; 14] = [
+const COLUMNS: [&str; 15] = [
     "DEM",
     "mesh",
     "tolerance",
+    "selected",
     "triangles",
     "with the mask",
     "left [%]",
@@ -89,7 +90,7 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     let mut masks = Table::new(
         "masks",
         "What is seen from the zone",
-        &["DEM", "zone", "samples", "eyes", "in the zone [%]", "seen [%]", "hidden [%]", "seconds"],
+        &["DEM", "zone", "samples", "eyes", "in the zone [%]", "seen [%]", "hidden [%]"],
     );
     let mut pictures = Vec::new();
     let mut notes = Vec::new();
@@ -111,11 +112,10 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     }
     notes.extend([
         format!(
-            "Eyes stand {} m above the highest ground of their polygon. The bitree's selection is {}, criterion \
-             {:?}. Hidden ground counts for {hidden}, and for more \
+            "Eyes stand {} m above the highest ground of their polygon. Of each bitree's selections, from the top and \
+             greedy, the better is taken: without / with the mask; criterion {:?}. Hidden ground counts for {hidden}, and for more \
              where it is hidden by less than {angle} radians over that. A pixel is {ANGLE} radians.",
             run.options.eye,
-            strategy(run),
             run.options.criterion,
         ),
         format!(
@@ -132,15 +132,12 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     Ok(Report { title: "Visibility from a zone".to_owned(), notes, tables: vec![table, masks], pictures })
 }
 
-/// How bitrees are selected: the way that is best nearly always, and takes the least time.
-fn strategy(run: &Run<'_>) -> Strategy {
-    if run.options.criterion == Criterion::Coefficient { Strategy::Direct } else { Strategy::Compact }
-}
-
 /// A mesh without and with the mask.
 struct Pair {
     kind: &'static str,
     tolerance: String,
+    /// How the bitrees' points were found.
+    selected: String,
     meshes: [Vec<[Point; 3]>; 2],
     /// Heights at every sample.
     surfaces: [Vec<f64>; 2],
@@ -180,7 +177,6 @@ fn one(
         Some(path) => region::from_polygon(run, window, &ground, path)?,
         None => region::from_lake(run, window, &ground)?,
     };
-    let started = std::time::Instant::now();
     let optics = Optics {
         cell: field.cell(),
         quantum: QUANTUM,
@@ -193,9 +189,8 @@ fn one(
     let mut mask =
         cast(&ground.relief, &optics, &region.eyes, run.progress).ok_or(ExperimentError::Stopped)?;
     region.own.iter().for_each(|(p, _)| mask.set(p.map(|w| w as usize), u8::MAX));
-    let seconds = started.elapsed().as_secs_f64();
     let mask: Vec<u8> = mask.rows().collect();
-    masks.push(told(window, &region, &mask, seconds));
+    masks.push(told(window, &region, &mask));
     pictures.push(Picture {
         file: format!("{number}-mask.png"),
         caption: format!(
@@ -225,26 +220,27 @@ fn one(
         let meshes = [mesh, templates::triangles(&Quadtree::new(field, &masked, threshold, None))];
         let surfaces = meshes.each_ref().map(|mesh| view::surface(field, mesh));
         let tolerance = format!("T = {threshold:.3e} ({share} % of the polygons)");
-        push(0, Pair { kind: "curvature quadtree", tolerance, meshes, surfaces })?;
+        let selected = String::new();
+        push(0, Pair { kind: "curvature quadtree", tolerance, selected, meshes, surfaces })?;
     }
     for percent in &run.options.tolerances {
         let tolerance = percent / 100.0 * whole;
-        let trees = grounds
-            .each_ref()
-            .map(|ground| by_strategy(ground, run.options.criterion, tolerance, strategy(run)));
+        let found = grounds.each_ref().map(|ground| select(ground, run.options.criterion, tolerance));
+        let selected = format!("{} / {}", found[0].1, found[1].1);
+        let trees = found.map(|(tree, _)| tree);
         let surfaces = trees.each_ref().map(|tree| scan::surface(field, tree));
         let meshes = trees.map(|tree| {
             tree.triangles().into_iter().map(|corners| corners.map(|(point, _)| point)).collect()
         });
         let tolerance = format!("{tolerance:.1} ({percent} %)");
-        push(1, Pair { kind: "bitree", tolerance, meshes, surfaces })?;
+        push(1, Pair { kind: "bitree", tolerance, selected, meshes, surfaces })?;
     }
     pictures.extend(sight.pictures(number, pictured.iter().filter_map(|pictured| pictured.0.as_ref()))?);
     Ok(())
 }
 
 /// A row about a mask.
-fn told(window: &Window, region: &Region, mask: &[u8], seconds: f64) -> Vec<String> {
+fn told(window: &Window, region: &Region, mask: &[u8]) -> Vec<String> {
     let percent = |is: &dyn Fn(u8) -> bool| {
         let count = mask.iter().filter(|share| is(**share)).count();
         format!("{:.1}", 100.0 * count as f64 / mask.len() as f64)
@@ -258,6 +254,5 @@ fn told(window: &Window, region: &Region, mask: &[u8], seconds: f64) -> Vec<Stri
         format!("{:.1}", 100.0 * region.own.len() as f64 / mask.len() as f64),
         percent(&|share| share == u8::MAX),
         percent(&|share| share == least && least < u8::MAX),
-        format!("{seconds:.1}"),
     ]
 }

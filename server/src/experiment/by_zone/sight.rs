@@ -92,7 +92,8 @@ impl<'a> Sight<'a> {
         let pairs = [(&masked, &plain), (&plain, &self.full), (&masked, &self.full)];
         let counts = pair.meshes.each_ref().map(Vec::len);
         let left = 100.0 * counts[1] as f64 / counts[0].max(1) as f64;
-        let head = [self.window.source.clone(), pair.kind.to_owned(), pair.tolerance.clone()];
+        let head =
+            [self.window.source.as_str(), pair.kind, &pair.tolerance, &pair.selected].map(str::to_owned);
         let counts = counts.map(|count| count.to_string()).into_iter().chain([format!("{left:.1}")]);
         let differences = pairs.map(|(a, b)| Self::difference(a, b));
         let cells = differences.iter().flatten().map(|pixels| format!("{pixels:.2}"));
