@@ -126,7 +126,7 @@ fn what_a_proxy_spoils_is_named() {
             "long addresses",
             Verdict::Bad,
             Arc::new(|request, head| {
-                let long = request.len() > 4096;
+                let long = request.len() > 1000;
                 if long { head.replacen("200 OK", "414 URI Too Long", 1) } else { head }
             }),
         ),
