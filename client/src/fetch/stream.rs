@@ -114,8 +114,8 @@ pub(super) fn weight(event: &Event) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use diamantina_protocol::index;
     use crate::world::world;
+    use diamantina_protocol::index;
 
     fn ledger() -> Ledger {
         let (diamonds, pages) = (HashSet::default(), HashSet::default());

@@ -14,7 +14,7 @@ use super::by_curvature::with_share;
 use super::curvature::quadtree::{Quadtree, Sums};
 use super::curvature::templates;
 use super::report::{Picture, Report, Table};
-use super::select::{Ground as Weighed, scale, select};
+use super::select::{Ground as Weighed, by_strategy, scale, select};
 use super::windows::Window;
 use super::{ExperimentError, Run, scan, view};
 use crate::zone::cast::{Optics, cast};
@@ -112,8 +112,8 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     }
     notes.extend([
         format!(
-            "Eyes stand {} m above the highest ground of their polygon. Of each bitree's selections, from the top and \
-             greedy, the better is taken: without / with the mask; criterion {:?}. Hidden ground counts for {hidden}, and for more \
+            "Eyes stand {} m above the highest ground of their polygon. Of each bitree's selections without the mask, \
+             from the top and greedy, the better is taken, and with the mask the same; criterion {:?}. Hidden ground counts for {hidden}, and for more \
              where it is hidden by less than {angle} radians over that. A pixel is {ANGLE} radians.",
             run.options.eye,
             run.options.criterion,
@@ -225,9 +225,10 @@ fn one(
     }
     for percent in &run.options.tolerances {
         let tolerance = percent / 100.0 * whole;
-        let found = grounds.each_ref().map(|ground| select(ground, run.options.criterion, tolerance));
-        let selected = format!("{} / {}", found[0].1, found[1].1);
-        let trees = found.map(|(tree, _)| tree);
+        let (plain, way) = select(&grounds[0], run.options.criterion, tolerance);
+        // In the same way, or else the two would differ by more than the mask.
+        let trees = [plain, by_strategy(&grounds[1], run.options.criterion, tolerance, way)];
+        let selected = way.to_string();
         let surfaces = trees.each_ref().map(|tree| scan::surface(field, tree));
         let meshes = trees.map(|tree| {
             tree.triangles().into_iter().map(|corners| corners.map(|(point, _)| point)).collect()
