@@ -2,7 +2,7 @@
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .NOTPARALLEL:
-.PHONY: help demo test test-long check contract bench bench-link bench-peers bench-serve bench-wasm setup fmt clippy tests doc deny wasm scripts
+.PHONY: help demo test test-long check contract objects bench bench-link bench-peers bench-serve bench-wasm setup fmt clippy tests doc deny wasm scripts
 
 # Mesa's device selection complains where there is no desktop session; there is nothing to select.
 export NODEVICE_SELECT := 1
@@ -26,7 +26,7 @@ demo:
 	@$(step) build cargo build --locked --release -p diamantina-server -p diamantina-client
 	$(target)/release/diamantina-server demo
 
-test: setup fmt clippy tests contract doc deny wasm scripts
+test: setup fmt clippy tests contract objects doc deny wasm scripts
 
 check: fmt clippy
 
@@ -73,6 +73,10 @@ test-long: setup
 contract:
 	@$(step) contract scripts/contract
 
+# The same, with an object store.
+objects:
+	@$(step) objects scripts/objects
+
 doc:
 	@RUSTDOCFLAGS="-D warnings" $(step) doc cargo doc --locked --workspace --no-deps
 
@@ -83,4 +87,4 @@ wasm:
 	@$(step) wasm scripts/wasm
 
 scripts:
-	@$(step) scripts shellcheck .ci/run scripts/bench scripts/bench-link scripts/bench-peers scripts/bench-serve scripts/bench-wasm scripts/contract scripts/deny scripts/setup scripts/step scripts/wasm scripts/wasm-cargo
+	@$(step) scripts shellcheck .ci/run scripts/bench scripts/bench-link scripts/bench-peers scripts/bench-serve scripts/bench-wasm scripts/contract scripts/deny scripts/objects scripts/setup scripts/step scripts/wasm scripts/wasm-cargo

@@ -36,7 +36,7 @@ const SERVER: &[(&str, &[&str])] = &[
     ("curve", &["inspect", "store", "stream"]),
     ("size", &[]),
     ("http", &["height", "inspect", "size", "store", "stream"]),
-    ("settings", &["http"]),
+    ("settings", &["http", "size"]),
     ("sample", &[]),
     ("client_program", &[]),
     ("demo", &["client_program", "hierarchy", "http", "ingest", "progress", "sample"]),

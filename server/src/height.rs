@@ -7,7 +7,7 @@
     reason = "places are checked to lie on the lattice before they become whole numbers"
 )]
 
-use crate::inspect::read_page;
+use crate::inspect::{InspectError, read_page};
 use crate::projection::Projection;
 use crate::store::{Key, Kind, Store, StoreError};
 use diamantina_protocol::NODATA;
@@ -217,8 +217,10 @@ fn decode(
     if payload.is_none() {
         // No payload is right only where the index says so.
         let page = diamantina_protocol::index::page_of(&layer.forest, d);
-        let entries = read_page(store, number, layer, Kind::Index, page)
-            .map_err(|e| HeightError::Damaged(e.to_string()))?;
+        let entries = read_page(store, number, layer, Kind::Index, page).map_err(|e| match e {
+            InspectError::Store(error) => HeightError::Store(error),
+            other => HeightError::Damaged(other.to_string()),
+        })?;
         if entries.iter().any(|(other, e)| *other == d && e.bytes > 0) {
             return Err(HeightError::Damaged(format!("the points of diamond {:?} are missing", [a, b])));
         }

@@ -33,7 +33,7 @@ pub use access::{TokensError, new_token};
 pub use limits::Limits;
 pub use tls::TlsError;
 
-use crate::store::{Store, StoreError};
+use crate::store::{Disk, Shared, Store, StoreError};
 use access::{Access, Caller};
 use blobs::Blobs;
 use front::Front;
@@ -97,6 +97,16 @@ pub struct Options {
     pub tokens: Option<PathBuf>,
     /// The files of a certificate and its key, both PEM: with them, what is sent is encrypted.
     pub certificate: Option<(PathBuf, PathBuf)>,
+    /// A folder for pieces of object stores, and how many bytes it may take.
+    pub disk_cache: Option<(PathBuf, u64)>,
+}
+
+impl Options {
+    /// What the stores of a server share.
+    fn shared(&self) -> Result<Arc<Shared>, StoreError> {
+        let disk = self.disk_cache.as_ref().map(|(folder, bytes)| Disk::open(folder, *bytes)).transpose()?;
+        Ok(Arc::new(Shared { disk, ..Shared::default() }))
+    }
 }
 
 /// What is served, and to whom.
@@ -121,6 +131,7 @@ impl Site {
 #[derive(Debug)]
 pub struct Server {
     scenes: Scenes,
+    shared: Arc<Shared>,
     access: Access,
     tls: Option<Arc<Tls>>,
     listener: TcpListener,
@@ -145,12 +156,13 @@ impl Server {
         let access = Access::open(options.tokens.as_deref())?;
         let tls = options.certificate.as_ref().map(|(certificate, key)| Tls::open(certificate, key));
         let tls = tls.transpose()?.map(Arc::new);
-        let scenes = Scenes::open(stores)?;
+        let shared = options.shared()?;
+        let scenes = Scenes::open(stores, &shared)?;
         let failed = |error| ServeError::Listen { address: listen, error };
         let listener = TcpListener::bind(listen).map_err(failed)?;
         listener.set_nonblocking(true).map_err(failed)?;
         let address = listener.local_addr().map_err(failed)?;
-        Ok(Self { scenes, access, tls, listener, address, limits: options.limits })
+        Ok(Self { scenes, shared, access, tls, listener, address, limits: options.limits })
     }
 
     /// Where the server listens, as a URL.
@@ -190,7 +202,7 @@ impl Server {
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         runtime.block_on(async move {
             let listener = tokio::net::TcpListener::from_std(self.listener)?;
-            let metrics = Arc::new(Metrics::new());
+            let metrics = Arc::new(Metrics::new(self.shared));
             let blobs = Arc::new(Blobs::new(self.limits.cache, Arc::clone(&metrics)));
             let site = Arc::new(Site { scenes: self.scenes, blobs, access: self.access, metrics });
             let front = Arc::new(Front::new(Arc::clone(&site), &self.limits));
@@ -210,7 +222,11 @@ pub fn check(stores: &[PathBuf], options: &Options) -> Result<Vec<String>, Serve
     if let Some((certificate, key)) = &options.certificate {
         Tls::open(certificate, key)?;
     }
-    Ok(Scenes::open(stores)?.all().iter().map(|store| store.scene().name.clone()).collect())
+    Ok(Scenes::open(stores, &options.shared()?)?
+        .all()
+        .iter()
+        .map(|store| store.scene().name.clone())
+        .collect())
 }
 
 /// Looks for what changes beside the server, as long as it runs: versions of scenes, tokens, certificates.

@@ -10,7 +10,7 @@ use diamantina_server::inspect::{self, Inspection, TinInspection};
 use diamantina_server::progress::Progress;
 use diamantina_server::settings::{self, LogFormat, Merged, Settings};
 use diamantina_server::size::parse_bytes;
-use diamantina_server::store::{Store, StoreError};
+use diamantina_server::store::{Disk, Published, Publisher, Shared, Store, StoreError, is_address, repair};
 use diamantina_server::tin::Metric;
 use diamantina_server::zone::polygon::Coordinates;
 use diamantina_server::zone::{self, ZoneError};
@@ -42,8 +42,12 @@ enum Command {
     Config(ConfigCommand),
     /// Make a token for a private scene, and the line for the file of `serve --tokens`
     Token(TokenArgs),
+    /// Put a built store into an object store, or what of it is not there yet
+    Publish(PublishArgs),
     /// Say what a store holds
     Inspect(InspectArgs),
+    /// Check every blob of a store, and mend what is damaged from another copy
+    Repair(RepairArgs),
     /// Compute what is seen from a region where the viewer stays, and add it to a store
     Zone(Box<ZoneArgs>),
     /// Build a sample scene, serve it and render a picture of it
@@ -60,9 +64,14 @@ struct BuildArgs {
     /// also in a .gz
     #[arg(required = true, value_name = "DEM")]
     sources: Vec<PathBuf>,
-    /// The folder of the store; an older scene in it is replaced once the new one is complete
+    /// The folder of the store, or the address of an object store (s3://BUCKET/PREFIX, gs://..., az://...); an older
+    /// scene there is replaced once the new one is complete
     #[arg(short, long, value_name = "STORE")]
     output: PathBuf,
+    /// Where the store is built before it is sent to an object store; then it stays there [default: NAME.upload here,
+    /// which goes once all is sent]
+    #[arg(long, value_name = "FOLDER")]
+    work: Option<PathBuf>,
     /// The largest error at the finest level, in metres; 0 is lossless (floats: to the quantum)
     #[arg(long, default_value_t = 0.0, value_name = "METRES", allow_negative_numbers = true)]
     max_error: f64,
@@ -163,8 +172,19 @@ struct TokenArgs {
 }
 
 #[derive(Args)]
-struct InspectArgs {
+struct PublishArgs {
     /// The folder of the store
+    store: PathBuf,
+    /// Where to: s3://BUCKET/PREFIX, gs://..., az://...
+    address: PathBuf,
+    /// Then remove all versions there but this one and the one before
+    #[arg(long)]
+    prune: bool,
+}
+
+#[derive(Args)]
+struct InspectArgs {
+    /// The folder of the store, or the address of an object store
     store: PathBuf,
     /// Print JSON
     #[arg(long)]
@@ -176,6 +196,16 @@ struct InspectArgs {
     /// here (- for standard output, and nothing else)
     #[arg(long, value_name = "CSV")]
     curve: Option<PathBuf>,
+}
+
+#[derive(Args)]
+struct RepairArgs {
+    /// The folder of the store, or the address of an object store
+    store: PathBuf,
+    /// A copy of the same version: a folder, the address of an object store, or http://HOST:PORT of a server [default:
+    /// nothing is mended, only told]
+    #[arg(long, value_name = "COPY")]
+    from: Option<PathBuf>,
 }
 
 #[derive(Args)]
@@ -322,12 +352,14 @@ fn main() -> ExitCode {
         given = inner;
     }
     let result = match cli.command {
-        Command::Build(args) => build(*args),
+        Command::Build(args) => build(&args),
         Command::Serve(args) => serve(given, args.config),
         Command::Config(ConfigCommand::Check(args)) => check_config(given, args.config),
         Command::Config(ConfigCommand::Print(args)) => print_config(given, args.config),
         Command::Token(args) => make_token(&args.scene),
+        Command::Publish(args) => publish(&args),
         Command::Inspect(args) => inspect_store(&args),
+        Command::Repair(args) => repair_store(&args),
         Command::Zone(args) => compute_zone(*args),
         Command::Demo(args) => demonstrate(&args),
         Command::Experiment(args) => experiment(&args, given),
@@ -378,12 +410,12 @@ fn scene_name(given: Option<String>, store: &Path) -> Result<String, Failure> {
     }
 }
 
-fn build(args: BuildArgs) -> Result<(), Failure> {
+fn build(args: &BuildArgs) -> Result<(), Failure> {
     if let Some(threads) = args.threads {
         rayon::ThreadPoolBuilder::new().num_threads(threads.into()).build_global()?;
     }
     let options = hierarchy::Options {
-        scene: scene_name(args.scene, &args.output)?,
+        scene: scene_name(args.scene.clone(), &args.output)?,
         layer: "terrain".to_owned(),
         kind: Kind::Terrain,
         max_error: args.max_error,
@@ -422,14 +454,23 @@ fn build(args: BuildArgs) -> Result<(), Failure> {
         }
         return Ok(());
     }
+    let upload = upload(args)?;
+    let built = upload.as_ref().map_or(&args.output, |upload| &upload.folder);
     // What a build replaces need not be a store that can be read.
-    let zones: Vec<String> = Store::open(&args.output)
+    let zones: Vec<String> = Store::open(built)
         .map(|s| s.scene().zones.iter().map(|z| z.name.clone()).collect())
         .unwrap_or_default();
     let progress = Arc::new(Progress::new());
     stop_on_signals(&progress)?;
-    let report = hierarchy::build(&source, &args.output, &options, &progress)
-        .map_err(|e| refuse_build(&args.sources, &e))?;
+    let report =
+        hierarchy::build(&source, built, &options, &progress).map_err(|e| refuse_build(&args.sources, &e))?;
+    if let Some(upload) = &upload {
+        send(&upload.publisher, built, &args.output, false, &progress)?;
+        if args.work.is_none() {
+            std::fs::remove_dir_all(built)
+                .map_err(|e| Failure(1, format!("{}: cannot remove it: {e}", built.display())))?;
+        }
+    }
     if !zones.is_empty() {
         let _ = writeln!(
             std::io::stderr(),
@@ -445,6 +486,75 @@ fn build(args: BuildArgs) -> Result<(), Failure> {
     } else {
         shown(print_report(&mut out, &args.output, &report))?;
     }
+    Ok(())
+}
+
+/// Where a build for an object store goes first, and then.
+struct Upload {
+    publisher: Publisher,
+    folder: PathBuf,
+}
+
+/// What a build needs whose output is an object store. That this can be written to is found before hours of work.
+fn upload(args: &BuildArgs) -> Result<Option<Upload>, Failure> {
+    if !is_address(&args.output) {
+        return match &args.work {
+            Some(_) => Err(Failure(2, "--work is for an output such as s3://BUCKET/PREFIX".to_owned())),
+            None => Ok(None),
+        };
+    }
+    let name = args.output.file_name().unwrap_or_default().to_string_lossy();
+    let folder = args.work.clone().unwrap_or_else(|| PathBuf::from(format!("{name}.upload")));
+    if is_address(&folder) {
+        return Err(Failure(2, format!("--work {}: expected a folder of this machine", folder.display())));
+    }
+    Ok(Some(Upload { publisher: Publisher::open(&args.output)?, folder }))
+}
+
+/// Publishes the store in a folder at an address.
+fn send(
+    publisher: &Publisher,
+    folder: &Path,
+    address: &Path,
+    prune: bool,
+    progress: &Progress,
+) -> Result<Published, Failure> {
+    progress.stage("sending", "bytes", Publisher::bytes(folder)?, 0);
+    let go_on = |bytes: u64| {
+        progress.advance(bytes);
+        !progress.is_stopping()
+    };
+    let again = || {
+        let (folder, address) = (folder.display(), address.display());
+        format!(
+            "the scene is complete in {folder}: `diamantina-server publish {folder} {address}` sends what is missing"
+        )
+    };
+    let published = publisher.publish(folder, prune, go_on);
+    progress.finish();
+    match published {
+        Ok(Some(published)) => Ok(published),
+        Ok(None) => Err(Failure(INTERRUPTED, format!("stopped; {}", again()))),
+        Err(error) => Err(Failure(1, format!("{error}; {}", again()))),
+    }
+}
+
+fn publish(args: &PublishArgs) -> Result<(), Failure> {
+    let progress = Arc::new(Progress::new());
+    stop_on_signals(&progress)?;
+    let publisher = Publisher::open(&args.address)?;
+    let Published { scene, sent, kept, pruned } =
+        send(&publisher, &args.store, &args.address, args.prune, &progress)?;
+    let mut out = std::io::stdout().lock();
+    let printed = writeln!(
+        out,
+        "{}: scene '{}', version {}: {sent} bytes sent, {kept} were there{}",
+        args.address.display(),
+        scene.name,
+        scene.version,
+        if args.prune { format!(", {pruned} objects of versions before removed") } else { String::new() }
+    );
+    shown(printed.and_then(|()| writeln!(out, "Next: diamantina-server serve {}", args.address.display())))?;
     Ok(())
 }
 
@@ -579,7 +689,8 @@ fn serving(settings: &Settings) -> Result<http::Options, Failure> {
         return Err(Failure(2, words.to_owned()));
     }
     let certificate = settings.certificate().map_err(|e| Failure(2, e.to_string()))?;
-    Ok(http::Options { limits: settings.limits, tokens: settings.tokens.clone(), certificate })
+    let disk_cache = settings.disk_cache.clone().map(|folder| (folder, settings.disk_cache_size));
+    Ok(http::Options { limits: settings.limits, tokens: settings.tokens.clone(), certificate, disk_cache })
 }
 
 fn serve(given: &ArgMatches, config: Option<PathBuf>) -> Result<(), Failure> {
@@ -625,8 +736,45 @@ fn make_token(scene: &str) -> Result<(), Failure> {
     Ok(())
 }
 
+/// Losses that are listed.
+const LOSSES_SHOWN: usize = 20;
+
+fn repair_store(args: &RepairArgs) -> Result<(), Failure> {
+    let progress = Progress::new();
+    progress.stage("checking", "blobs", 0, 0);
+    let repaired = repair::repair(&args.store, args.from.as_deref(), |blobs| progress.advance(blobs));
+    progress.finish();
+    let report = repaired?;
+    let mut out = std::io::stdout().lock();
+    let printed = writeln!(
+        out,
+        "{}: version {}, {} blobs: {} mended, {} damaged{}",
+        args.store.display(),
+        report.version,
+        report.blobs,
+        report.mended,
+        report.lost.len(),
+        if report.directory { "; the directory was replaced" } else { "" }
+    );
+    let listed = report.lost.iter().take(LOSSES_SHOWN).try_for_each(|lost| writeln!(out, "  {lost}"));
+    shown(printed.and(listed))?;
+    if report.lost.is_empty() {
+        return Ok(());
+    }
+    let words = "not all could be mended: name another copy of this version with --from; or build the same DEM with the same \
+                 options into another folder, which gives the same version, and mend --from that one";
+    Err(Failure(1, words.to_owned()))
+}
+
+/// Bytes of a remote store that are kept on the disk while it is inspected.
+const INSPECTED_BYTES: u64 = 1 << 30;
+
 fn inspect_store(args: &InspectArgs) -> Result<(), Failure> {
-    let store = Arc::new(Store::open(&args.store)?);
+    // Blobs are read one by one, and an object store is asked for whole pieces of packs.
+    let folder = is_address(&args.store).then(tempfile::tempdir).transpose()?;
+    let disk = folder.as_ref().map(|folder| Disk::open(folder.path(), INSPECTED_BYTES)).transpose()?;
+    let shared = Arc::new(Shared { disk, ..Shared::default() });
+    let store = Arc::new(Store::open_sharing(&args.store, &shared)?);
     let inspection = inspect::inspect(&store, args.verify)?;
     let mut out = std::io::stdout().lock();
     if let Some(path) = &args.curve {

@@ -4,6 +4,7 @@
 //! What was not said by a flag is made one, so that there is one judge of values, clap.
 
 use crate::http::Limits;
+use crate::size::parse_bytes;
 use clap::parser::ValueSource;
 use clap::{Arg, ArgMatches, Args, Command, FromArgMatches, ValueEnum};
 use std::ffi::{OsStr, OsString};
@@ -24,7 +25,7 @@ const ALIKE: f64 = 0.7;
 /// How a server serves.
 #[derive(Debug, Clone, Args)]
 pub struct Settings {
-    /// Folders of stores
+    /// Stores: folders, or addresses of object stores (s3://BUCKET/PREFIX, gs://..., az://...)
     #[arg(value_name = "STORE")]
     pub stores: Vec<PathBuf>,
     /// The address to listen on; port 0 picks a free one
@@ -40,6 +41,12 @@ pub struct Settings {
     /// it changes
     #[arg(long, value_name = "FILE")]
     pub tokens: Option<PathBuf>,
+    /// A folder of this server's own to keep what it reads from object stores [default: it is kept in memory alone]
+    #[arg(long, value_name = "FOLDER")]
+    pub disk_cache: Option<PathBuf>,
+    /// The most bytes that --disk-cache takes
+    #[arg(long, default_value = "10GiB", value_name = "BYTES", value_parser = parse_bytes)]
+    pub disk_cache_size: u64,
     /// How the log is written, on standard error; RUST_LOG says how much: info has a line for each request
     #[arg(long, default_value = "text", value_enum)]
     pub log_format: LogFormat,
@@ -210,11 +217,7 @@ pub fn merge(
             (raw.map(OsStr::to_owned).collect(), Origin::Flag)
         } else if let Some((name, value)) = variable {
             let is_list = key == "stores";
-            let values = if is_list {
-                std::env::split_paths(value).map(Into::into).collect()
-            } else {
-                vec![value.clone()]
-            };
+            let values = if is_list { split(value) } else { vec![value.clone()] };
             (values, Origin::Variable(name.clone()))
         } else if let Some((_, values)) = filed.iter().find(|(k, _)| *k == key) {
             (values.iter().map(Into::into).collect(), Origin::File)
@@ -248,6 +251,26 @@ pub fn merge(
     let settings = Settings::from_arg_matches(&matches).map_err(whole)?;
     let lines = origins.into_iter().map(|(key, origin)| (line(&command, &matches, &key), origin)).collect();
     Ok(Merged { settings, lines, notices: notices(variables, &known) })
+}
+
+/// The parts of a list with colons. The one in the address of an object store parts nothing.
+fn split(list: &OsStr) -> Vec<OsString> {
+    let mut parts: Vec<OsString> = Vec::new();
+    for part in std::env::split_paths(list).map(PathBuf::into_os_string) {
+        match parts.last_mut() {
+            Some(last) if part.as_encoded_bytes().starts_with(b"//") && is_scheme(last) => {
+                last.push(":");
+                last.push(&part);
+            }
+            _ => parts.push(part),
+        }
+    }
+    parts
+}
+
+fn is_scheme(word: &OsStr) -> bool {
+    let bytes = word.as_encoded_bytes();
+    !bytes.is_empty() && bytes.iter().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit())
 }
 
 /// Whether a value is one for this argument; if not, why.
@@ -353,6 +376,9 @@ mod tests {
         assert_eq!(elsewhere.settings.stores, [PathBuf::from("x")]);
         let varied = merged(&[], file, &[("DIAMANTINA_STORES", "y:z")]).unwrap();
         assert_eq!(varied.settings.stores, ["y", "z"].map(PathBuf::from));
+        let remote =
+            merged(&[], "", &[("DIAMANTINA_STORES", "s3://b/x:/y:gs://c/z")]).unwrap().settings.stores;
+        assert_eq!(remote, ["s3://b/x", "/y", "gs://c/z"].map(PathBuf::from));
         // What is printed says the same again.
         let printed = found.to_toml();
         let again = merged(&[], &printed, &[]).unwrap();

@@ -30,18 +30,31 @@
 //! | 28 + 32 i | 4 + 4 | offset in the pack, bytes | inside the pack |
 //! | 36 + 32 i | 8 | XXH3 of the blob | |
 
+mod disk;
+mod objects;
+mod publish;
+mod remote;
+pub mod repair;
+mod transport;
 pub mod zones;
+
+pub use disk::Disk;
+pub use objects::is_address;
+pub use publish::{Published, Publisher};
+pub use remote::{Counts, Shared};
 
 use bytes::Bytes;
 use diamantina_protocol::message::Scene;
+use objects::{Failure, Manner, Objects, folder, runtime};
+use remote::Remote;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
 use xxhash_rust::xxh3::xxh3_64;
 
 /// The format that this build writes, and the only one that it reads.
@@ -163,8 +176,56 @@ pub enum StoreError {
         /// Bytes.
         found: usize,
     },
+    /// What should name an object store does not.
+    #[error("{address}: {reason}")]
+    Address {
+        /// What was given.
+        address: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// An object store does not let us.
+    #[error(
+        "{address}: access denied ({reason}): set the credentials of the object store in the environment (AWS_..., \
+         GOOGLE_..., AZURE_...), with the right to read there, and to write for whoever publishes"
+    )]
+    Denied {
+        /// Where.
+        address: String,
+        /// What the store said.
+        reason: String,
+    },
+    /// An object store cannot be reached.
+    #[error(
+        "{address}: the object store cannot be reached ({reason}): check the address, AWS_ENDPOINT and the like, the network and the store"
+    )]
+    Away {
+        /// Where.
+        address: String,
+        /// What happened.
+        reason: String,
+    },
+    /// Somebody else published.
+    #[error(
+        "{address}: somebody else has published another version there in the meantime: that one stays; look at it, and \
+         publish again to replace it"
+    )]
+    Overtaken {
+        /// The description.
+        address: String,
+    },
+    /// The disk cache cannot be used.
+    #[error("{path}: no disk cache: {what}")]
+    DiskCache {
+        /// The folder.
+        path: PathBuf,
+        /// Why not.
+        what: String,
+    },
     /// The content does not match its hashes.
-    #[error("{path}: damaged: {what}; build the store again, or copy it again from where it is intact")]
+    #[error(
+        "{path}: damaged: {what}; mend the store from a copy with `diamantina-server repair`, or build it again"
+    )]
     Damaged {
         /// The file.
         path: PathBuf,
@@ -201,7 +262,6 @@ fn foreign(root: &Path) -> Option<String> {
         return None;
     }
     let built_here = names.iter().any(|name| name == LOCK_FILE);
-    let is_version = |name: &str| name.len() == 16 && name.bytes().all(|b| b.is_ascii_hexdigit());
     names.into_iter().find(|name| match name.as_str() {
         LOCK_FILE | WORK_FOLDER | zones::WORK_FOLDER | "lost+found" => false,
         // A damaged description, and versions whose build was killed before it was there.
@@ -235,7 +295,7 @@ impl Manifest {
 }
 
 /// Where a blob lies.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Place {
     pack: u32,
     offset: u32,
@@ -347,6 +407,13 @@ impl Writer {
     /// # Errors
     /// When another program is at work there or the folder cannot be written.
     pub fn create(root: &Path) -> Result<Self, StoreError> {
+        if is_address(root) {
+            return Err(StoreError::Address {
+                address: root.to_string_lossy().into_owned(),
+                reason: "a store is built in a folder, and published from there".to_owned(),
+            });
+        }
+        let root = folder(root);
         if let Some(found) = foreign(root) {
             return Err(StoreError::Foreign { path: root.to_owned(), found });
         }
@@ -557,9 +624,8 @@ fn move_into_place(data: &Path, place: &Path) -> Result<(), StoreError> {
 fn remove_others(root: &Path, current: &str) {
     for entry in fs::read_dir(root).into_iter().flatten().flatten() {
         let name = entry.file_name();
-        let version =
-            name.to_str().is_some_and(|n| n.len() == 16 && n.bytes().all(|b| b.is_ascii_hexdigit()));
-        if version && name != current && entry.path().join("directory").exists() {
+        if name.to_str().is_some_and(is_version) && name != current && entry.path().join("directory").exists()
+        {
             let _ = fs::remove_dir_all(entry.path());
         }
     }
@@ -615,6 +681,11 @@ fn lay_packs(
     Ok(Some((entries, pack_bytes)))
 }
 
+/// Whether something is named as a version is.
+fn is_version(name: &str) -> bool {
+    name.len() == 16 && name.bytes().all(|b| b.is_ascii_hexdigit())
+}
+
 fn pack_name(number: usize) -> String {
     format!("pack-{number:05}")
 }
@@ -630,6 +701,15 @@ fn sync_folder(path: &Path) -> Result<(), StoreError> {
 }
 
 impl Manifest {
+    /// Where the blobs lie, as the directory at `path` says.
+    fn places(&self, directory: &[u8], path: &Path) -> Result<HashMap<Key, Place>, StoreError> {
+        let damaged = |what: String| StoreError::Damaged { path: path.to_owned(), what };
+        if blake3::hash(directory).to_hex().as_str() != self.directory_hash {
+            return Err(damaged("it does not match the hash in scene.json".to_owned()));
+        }
+        Ok(read_directory(directory, &self.pack_bytes).map_err(damaged)?.into_iter().collect())
+    }
+
     fn read(root: &Path) -> Result<Self, StoreError> {
         let path = root.join(SCENE_FILE);
         let mut file = match File::open(&path) {
@@ -641,9 +721,14 @@ impl Manifest {
         };
         let mut text = Vec::new();
         Read::by_ref(&mut file).take(SCENE_BYTES_MAX).read_to_end(&mut text).map_err(io_at("read", &path))?;
-        let damaged = |what: String| StoreError::Damaged { path: path.clone(), what };
+        Self::parse(&text, &path, root)
+    }
+
+    /// What the text of a description at `path` says, of the store at `root`.
+    fn parse(text: &[u8], path: &Path, root: &Path) -> Result<Self, StoreError> {
+        let damaged = |what: String| StoreError::Damaged { path: path.to_owned(), what };
         let value: serde_json::Value =
-            serde_json::from_slice(&text).map_err(|e| damaged(format!("not JSON ({e})")))?;
+            serde_json::from_slice(text).map_err(|e| damaged(format!("not JSON ({e})")))?;
         match value.get("format").and_then(serde_json::Value::as_u64) {
             Some(format) if format == u64::from(FORMAT) => {}
             Some(format) => {
@@ -654,7 +739,7 @@ impl Manifest {
         }
         let manifest: Self = serde_json::from_value(value).map_err(|e| damaged(e.to_string()))?;
         // The hash below is of values; what reads as the same values but was not written so is damage too.
-        if serde_json::to_vec_pretty(&manifest).ok().as_ref() != Some(&text) {
+        if serde_json::to_vec_pretty(&manifest).ok().as_deref() != Some(text) {
             return Err(damaged("its text is not as it was written".to_owned()));
         }
         if manifest.version() != manifest.scene.version {
@@ -668,31 +753,59 @@ impl Manifest {
     }
 }
 
+/// Bytes of a directory that are read at once from an object store.
+const DIRECTORY_PIECE: u64 = 4 << 20;
+
+/// Where blobs are read from.
+#[derive(Debug)]
+enum Source {
+    /// Files, open.
+    Packs(Vec<(PathBuf, File)>),
+    Remote(Arc<Remote>),
+}
+
 /// A store opened for reading. Cheap to share; reads do not block one another.
 #[derive(Debug)]
 pub struct Store {
     root: PathBuf,
     scene: Scene,
-    packs: Vec<(PathBuf, File)>,
+    source: Source,
     places: HashMap<Key, Place>,
+    shared: Arc<Shared>,
+}
+
+fn damaged_blob(path: PathBuf, key: Key, place: &Place, found: u64) -> StoreError {
+    let what = format!(
+        "blob {key:?} at byte {} has checksum {found:016x}, expected {:016x}",
+        place.offset, place.checksum
+    );
+    StoreError::Damaged { path, what }
 }
 
 impl Store {
-    /// Opens the scene that is current at `root`, checking the description and the directory against
-    /// their hashes. Takes about 60 bytes of memory a blob.
+    /// Opens the scene that is current at `root`, a folder or the address of an object store, checking the description
+    /// and the directory against their hashes. Takes about 60 bytes of memory a blob.
     ///
     /// # Errors
     /// When there is no store, it is of another format, or damaged.
     pub fn open(root: &Path) -> Result<Self, StoreError> {
+        Self::open_sharing(root, &Arc::default())
+    }
+
+    /// The same, with what stores share.
+    ///
+    /// # Errors
+    /// As [`Store::open`].
+    pub fn open_sharing(root: &Path, shared: &Arc<Shared>) -> Result<Self, StoreError> {
+        if is_address(root) {
+            return Self::open_remote(root, Objects::open(root, Manner::Serving)?, shared);
+        }
+        let root = folder(root);
         let manifest = Manifest::read(root)?;
         let data = root.join(&manifest.scene.version);
         let path = data.join("directory");
-        let damaged = |what: String| StoreError::Damaged { path: path.clone(), what };
         let bytes = fs::read(&path).map_err(io_at("read", &path))?;
-        if blake3::hash(&bytes).to_hex().as_str() != manifest.directory_hash {
-            return Err(damaged("it does not match the hash in scene.json".to_owned()));
-        }
-        let places = read_directory(&bytes, &manifest.pack_bytes).map_err(damaged)?.into_iter().collect();
+        let places = manifest.places(&bytes, &path)?;
         let mut packs = Vec::new();
         for (i, expected) in manifest.pack_bytes.iter().enumerate() {
             let path = data.join(pack_name(i));
@@ -704,18 +817,90 @@ impl Store {
             }
             packs.push((path, file));
         }
-        Ok(Self { root: root.to_owned(), scene: manifest.scene, packs, places })
+        let (source, shared) = (Source::Packs(packs), Arc::clone(shared));
+        Ok(Self { root: root.to_owned(), scene: manifest.scene, source, places, shared })
     }
 
-    /// The version that is published at `root`, whatever is open.
+    fn open_remote(root: &Path, objects: Objects, shared: &Arc<Shared>) -> Result<Self, StoreError> {
+        runtime()?.block_on(async {
+            let path = objects.address(SCENE_FILE);
+            let described =
+                objects.read(SCENE_FILE, SCENE_BYTES_MAX).await.map_err(|failure| match failure {
+                    Failure::Missing => StoreError::NotAStore(root.to_owned()),
+                    other => other.at(path.clone()),
+                })?;
+            let manifest = Manifest::parse(&described.bytes, Path::new(&path), root)?;
+            let version = manifest.scene.version.clone();
+            let below = format!("{version}/directory");
+            let path = objects.address(&below);
+            let bytes = objects.read_long(&below, DIRECTORY_PIECE).await.map_err(|f| f.at(path.clone()))?;
+            let places = manifest.places(&bytes, Path::new(&path))?;
+            let remote = Remote {
+                objects,
+                number: number(&version),
+                version,
+                pack_bytes: manifest.pack_bytes,
+                e_tag: described.version.e_tag,
+                shared: Arc::clone(shared),
+                asking: std::array::from_fn(|_| tokio::sync::Mutex::new(())),
+            };
+            let (source, shared) = (Source::Remote(Arc::new(remote)), Arc::clone(shared));
+            Ok(Self { root: root.to_owned(), scene: manifest.scene, source, places, shared })
+        })
+    }
+
+    /// Opens what is current now where this store is from.
     ///
     /// # Errors
-    /// When there is no store, or one of another format.
-    pub fn published(root: &Path) -> Result<String, StoreError> {
-        Ok(Manifest::read(root)?.scene.version)
+    /// As [`Store::open`].
+    pub fn reopen(&self) -> Result<Self, StoreError> {
+        match &self.source {
+            Source::Packs(_) => Self::open_sharing(&self.root, &self.shared),
+            // With its connections, and what is known of it.
+            Source::Remote(remote) => Self::open_remote(&self.root, remote.objects.clone(), &self.shared),
+        }
     }
 
-    /// The folder.
+    /// The version that is published where this store is from, if it is another one.
+    ///
+    /// # Errors
+    /// When there is no store, or one of another format, or it cannot be reached.
+    pub fn newer(&self) -> Result<Option<String>, StoreError> {
+        let manifest = match &self.source {
+            Source::Packs(_) => Some(Manifest::read(&self.root)?),
+            Source::Remote(remote) => runtime()?.block_on(async {
+                let path = remote.objects.address(SCENE_FILE);
+                let known = remote.e_tag.as_deref();
+                let read = remote.objects.read_newer(SCENE_FILE, SCENE_BYTES_MAX, known).await;
+                let thing = read.map_err(|failure| failure.at(path.clone()))?;
+                thing.map(|thing| Manifest::parse(&thing.bytes, Path::new(&path), &self.root)).transpose()
+            })?,
+        };
+        Ok(manifest.map(|manifest| manifest.scene.version).filter(|version| *version != self.scene.version))
+    }
+
+    /// Whether blobs come from an object store.
+    #[must_use]
+    pub fn is_remote(&self) -> bool {
+        matches!(self.source, Source::Remote(_))
+    }
+
+    /// How long the object store has not been reached, if it is one and that is so.
+    #[must_use]
+    pub fn away(&self) -> Option<std::time::Duration> {
+        match &self.source {
+            Source::Packs(_) => None,
+            Source::Remote(remote) => remote.objects.away(),
+        }
+    }
+
+    /// What stores that were opened together share.
+    #[must_use]
+    pub fn shared(&self) -> &Arc<Shared> {
+        &self.shared
+    }
+
+    /// The folder, or the address.
     #[must_use]
     pub fn root(&self) -> &Path {
         &self.root
@@ -733,28 +918,103 @@ impl Store {
         self.places.contains_key(&key)
     }
 
-    /// The blob of a key, checked; `None` if there is none.
+    /// The blob of a key, checked; `None` if there is none. Waits for the disk or the network: never to be called by a
+    /// task of an async runtime.
     ///
     /// # Errors
-    /// When the disk fails or the blob does not match its checksum.
+    /// When the disk or the object store fails or the blob does not match its checksum.
     pub fn get(&self, key: Key) -> Result<Option<Bytes>, StoreError> {
         let Some(place) = self.places.get(&key) else { return Ok(None) };
-        let (path, file) = &self.packs[place.pack as usize];
+        let packs = match &self.source {
+            Source::Packs(packs) => packs,
+            Source::Remote(remote) => {
+                let blobs = runtime()?.block_on(remote.blobs(&[(key, *place)]));
+                return blobs.into_iter().next().transpose();
+            }
+        };
+        let (path, file) = &packs[place.pack as usize];
         let mut blob = vec![0; place.bytes as usize];
         file.read_exact_at(&mut blob, place.offset.into()).map_err(io_at("read", path))?;
         let found = xxh3_64(&blob);
         if found != place.checksum {
-            let what = format!(
-                "blob {key:?} at byte {} has checksum {found:016x}, expected {:016x}",
-                place.offset, place.checksum
-            );
-            return Err(StoreError::Damaged { path: path.clone(), what });
+            return Err(damaged_blob(path.clone(), key, place, found));
         }
         Ok(Some(blob.into()))
+    }
+
+    /// As [`Store::get`], for many; those that lie together in an object store are asked for together.
+    pub fn get_many(&self, keys: &[Key]) -> Vec<Result<Option<Bytes>, StoreError>> {
+        let Source::Remote(remote) = &self.source else {
+            return keys.iter().map(|key| self.get(*key)).collect();
+        };
+        let wanted = self.wanted(keys);
+        match runtime() {
+            Ok(runtime) => in_place(&wanted, runtime.block_on(remote.blobs(&found(&wanted)))),
+            // It says why each time.
+            Err(_) => keys.iter().map(|key| self.get(*key)).collect(),
+        }
+    }
+
+    /// As [`Store::get_many`], without a thread that waits, where blobs come from an object store; `None` elsewhere.
+    pub async fn fetch(&self, keys: &[Key]) -> Option<Vec<Result<Option<Bytes>, StoreError>>> {
+        let Source::Remote(remote) = &self.source else { return None };
+        let wanted = self.wanted(keys);
+        let (remote, asked) = (Arc::clone(remote), found(&wanted));
+        let blobs = runtime().ok()?.spawn(async move { remote.blobs(&asked).await }).await.ok()?;
+        Some(in_place(&wanted, blobs))
+    }
+
+    fn wanted(&self, keys: &[Key]) -> Vec<Option<(Key, Place)>> {
+        keys.iter().map(|key| self.places.get(key).map(|place| (*key, *place))).collect()
     }
 
     /// Every key with its size in bytes, in no order.
     pub fn keys(&self) -> impl Iterator<Item = (Key, u32)> {
         self.places.iter().map(|(key, place)| (*key, place.bytes))
     }
+
+    /// Reads the last blob of each pack: that it is there and whole.
+    ///
+    /// # Errors
+    /// As [`Store::get`].
+    pub fn probe(&self) -> Result<(), StoreError> {
+        let mut last: HashMap<u32, (u32, Key)> = HashMap::new();
+        for (key, place) in &self.places {
+            let found = last.entry(place.pack).or_insert((place.offset, *key));
+            *found = (*found).max((place.offset, *key));
+        }
+        let keys: Vec<Key> = last.into_values().map(|(_, key)| key).collect();
+        for keys in keys.chunks(64) {
+            self.get_many(keys).into_iter().try_for_each(|blob| blob.map(drop))?;
+        }
+        Ok(())
+    }
+
+    /// Every key, as the blobs lie.
+    #[must_use]
+    pub fn keys_in_order(&self) -> Vec<Key> {
+        let mut keys: Vec<(u32, u32, Key)> =
+            self.places.iter().map(|(k, p)| (p.pack, p.offset, *k)).collect();
+        keys.sort_unstable();
+        keys.into_iter().map(|(.., key)| key).collect()
+    }
+}
+
+fn found(wanted: &[Option<(Key, Place)>]) -> Vec<(Key, Place)> {
+    wanted.iter().flatten().copied().collect()
+}
+
+/// Puts blobs where their keys were, with nothing between where there is none.
+fn in_place(
+    wanted: &[Option<(Key, Place)>],
+    blobs: Vec<Result<Bytes, StoreError>>,
+) -> Vec<Result<Option<Bytes>, StoreError>> {
+    let mut blobs = blobs.into_iter();
+    wanted.iter().map(|found| found.as_ref().and_then(|_| blobs.next()).transpose()).collect()
+}
+
+/// A version, which is a hash, as a number.
+#[must_use]
+pub fn number(version: &str) -> u64 {
+    u64::from_str_radix(version, 16).unwrap_or_else(|_| xxh3_64(version.as_bytes()))
 }

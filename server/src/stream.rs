@@ -13,7 +13,7 @@
 //! numbers of the pages, some 150 bytes for each diamond sent, and [`PAGES_HELD`] decoded pages, 2 MB.
 
 use crate::inspect::{InspectError, read_page};
-use crate::store::{Key, Kind, Store};
+use crate::store::{Key, Kind, Store, StoreError};
 use bytes::Bytes;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
@@ -26,6 +26,9 @@ use std::sync::Arc;
 
 /// Decoded pages that a stream keeps at hand: some 30 kB each.
 pub const PAGES_HELD: usize = 64;
+
+/// Payloads that are asked of an object store at once, and held until their turn comes: some 8 kB each.
+const AHEAD: usize = 48;
 
 /// What a frame holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -111,6 +114,10 @@ impl Stream {
             let blob = self.pages.blob(page)?;
             (Subject::Page(page), FrameHeader::of_page(page, &blob), blob)
         } else if let Some(d) = self.ready.take() {
+            if self.pages.store.is_remote() && !self.pages.ahead.contains_key(&d) {
+                let next = self.likely();
+                self.pages.read_ahead(d, next);
+            }
             let payload = self.pages.payload(d)?;
             (Subject::Diamond(d), FrameHeader::of(d.centre(), &payload), payload)
         } else {
@@ -153,6 +160,16 @@ impl Stream {
             }
         }
         Ok(self.due.pop_front())
+    }
+
+    /// Diamonds that probably come next: those that are due, and the largest errors of the heap.
+    fn likely(&self) -> Vec<Diamond> {
+        let mut heap: Vec<&Candidate> = self.heap.iter().collect();
+        if heap.len() > AHEAD {
+            heap.select_nth_unstable_by(AHEAD, |a, b| b.cmp(a));
+            heap.truncate(AHEAD);
+        }
+        self.due.iter().copied().chain(heap.into_iter().map(|c| c.diamond)).take(AHEAD).collect()
     }
 
     /// A diamond and those of its ancestors that have not been sent, coarse first.
@@ -262,12 +279,14 @@ struct Pages {
     seen: HashSet<u32>,
     /// Those of them that have not been sent.
     fresh: VecDeque<u32>,
+    /// Payloads that were asked for before their turn. Each is sent sooner or later, or the stream ends.
+    ahead: HashMap<Diamond, Result<Option<Bytes>, StoreError>>,
 }
 
 impl Pages {
     fn new(store: Arc<Store>, number: u8, layer: Layer) -> Self {
         let (held, seen, fresh) = (HashMap::new(), HashSet::new(), VecDeque::new());
-        Self { store, number, layer, held, now: 0, seen, fresh }
+        Self { store, number, layer, held, now: 0, seen, fresh, ahead: HashMap::new() }
     }
 
     fn entry(&mut self, d: Diamond) -> Result<Entry, InspectError> {
@@ -301,12 +320,25 @@ impl Pages {
         blob.ok_or_else(|| InspectError::NoPage { layer: self.layer.name.clone(), page })
     }
 
+    /// Reads the payload of a diamond, and of others where that is as much as of these.
+    fn read_ahead(&mut self, d: Diamond, others: Vec<Diamond>) {
+        let others = others.into_iter().filter(|other| *other != d && !self.ahead.contains_key(other));
+        let wanted: Vec<Diamond> = std::iter::once(d).chain(others).collect();
+        let key =
+            |d: &Diamond| Key { layer: self.number, kind: Kind::Points, a: d.centre()[0], b: d.centre()[1] };
+        let blobs = self.store.get_many(&wanted.iter().map(key).collect::<Vec<_>>());
+        self.ahead.extend(wanted.into_iter().zip(blobs));
+    }
+
     /// A diamond's payload; without bytes where the index says that there is none.
     fn payload(&mut self, d: Diamond) -> Result<Bytes, InspectError> {
         let expected = self.entry(d)?.bytes;
         let [a, b] = d.centre();
-        let payload =
-            self.store.get(Key { layer: self.number, kind: Kind::Points, a, b })?.unwrap_or_default();
+        let payload = match self.ahead.remove(&d) {
+            Some(read) => read?,
+            None => self.store.get(Key { layer: self.number, kind: Kind::Points, a, b })?,
+        };
+        let payload = payload.unwrap_or_default();
         let (layer, centre) = (|| self.layer.name.clone(), [a, b]);
         match u32::try_from(payload.len()).unwrap_or(u32::MAX) {
             found if found == expected => Ok(payload),

@@ -13,6 +13,9 @@ pub(super) const IMMUTABLE: &str = "public, max-age=31536000, immutable";
 /// For the same of a private scene: no cache that others share may keep it.
 pub(super) const IMMUTABLE_PRIVATE: &str = "private, max-age=31536000, immutable";
 
+/// Seconds after which whoever asked for what could not be had from an object store may ask again.
+const AWAY_RETRY_AFTER: u64 = 2;
+
 pub(super) const OCTETS: &str = "application/octet-stream";
 
 /// A refusal, sent as problem+json (RFC 9457).
@@ -21,6 +24,8 @@ pub(super) struct Refusal {
     detail: String,
     /// What the log is told and the answer is not.
     cause: Option<Cause>,
+    /// Seconds after which it may be asked again.
+    later: Option<u64>,
 }
 
 /// What went wrong on our side, in the extensions of an answer.
@@ -29,7 +34,7 @@ pub(super) struct Cause(pub(super) Arc<str>);
 
 impl Refusal {
     pub(super) fn new(status: StatusCode, detail: impl Into<String>) -> Self {
-        Self { status, detail: detail.into(), cause: None }
+        Self { status, detail: detail.into(), cause: None, later: None }
     }
 
     /// What is served here is damaged. The log says where; the answer does not tell strangers about our disks.
@@ -37,6 +42,14 @@ impl Refusal {
         let refusal =
             Self::new(StatusCode::INTERNAL_SERVER_ERROR, "the store is damaged here: the log says where");
         Self { cause: Some(Cause(cause.to_string().into())), ..refusal }
+    }
+}
+
+impl Refusal {
+    /// What is served here comes from a store that cannot be reached now.
+    pub(super) fn away() -> Self {
+        let detail = "where this comes from cannot be reached now: ask again in a moment";
+        Self { later: Some(AWAY_RETRY_AFTER), ..Self::new(StatusCode::SERVICE_UNAVAILABLE, detail) }
     }
 }
 
@@ -48,6 +61,9 @@ impl IntoResponse for Refusal {
         let headers =
             [(header::CONTENT_TYPE, "application/problem+json"), (header::CACHE_CONTROL, "no-store")];
         let mut response = (self.status, headers, body).into_response();
+        if let Some(seconds) = self.later {
+            response.headers_mut().insert(header::RETRY_AFTER, seconds.into());
+        }
         if let Some(cause) = self.cause {
             response.extensions_mut().insert(cause);
         }
@@ -57,6 +73,9 @@ impl IntoResponse for Refusal {
 
 impl From<StoreError> for Refusal {
     fn from(error: StoreError) -> Self {
+        if matches!(error, StoreError::Away { .. }) {
+            return Self::away();
+        }
         Self::damaged(&error)
     }
 }

@@ -4,10 +4,11 @@
 //! asked for again and again stays, what is asked for once soon goes (quick_cache's S3-FIFO), and the budget is of bytes.
 
 use super::metrics::Metrics;
-use crate::store::{Key, Store, StoreError};
+use crate::store::{Key, Store, StoreError, number};
 use bytes::Bytes;
 use quick_cache::sync::{Cache, DefaultLifecycle};
 use quick_cache::{DefaultHashBuilder, OptionsBuilder, Weighter};
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -16,6 +17,9 @@ const OVERHEAD_BYTES: u64 = 128;
 
 /// Parts of the cache that do not wait for one another. Blobs larger than a part's budget are not kept.
 const SHARDS: usize = 8;
+
+/// What came of reading a blob.
+pub(super) type Read = Result<Option<Bytes>, StoreError>;
 
 /// A blob of a version of a scene; a version is a hash of all its content.
 type Name = (u64, Key);
@@ -37,8 +41,7 @@ pub(super) struct Blobs {
 }
 
 fn name(store: &Store, key: Key) -> Name {
-    let version = &store.scene().version;
-    (u64::from_str_radix(version, 16).unwrap_or_else(|_| xxhash_rust::xxh3::xxh3_64(version.as_bytes())), key)
+    (number(&store.scene().version), key)
 }
 
 impl Blobs {
@@ -68,26 +71,55 @@ impl Blobs {
     /// When the disk fails or the blob does not match its checksum.
     pub(super) fn read(&self, store: &Store, key: Key) -> Result<Option<Bytes>, StoreError> {
         let started = Instant::now();
-        let read = store.get(key).inspect_err(|error| self.failed(error))?;
-        if let Some(blob) = &read {
-            self.metrics.cache_misses.inc();
-            self.metrics.store_reads.inc();
-            self.metrics.store_read_bytes.inc_by(blob.len() as u64);
-            self.metrics.store_read_seconds.observe(started.elapsed().as_secs_f64());
-            if let Some(cache) = &self.cache {
-                cache.insert(name(store, key), blob.clone());
+        let read = store.get(key);
+        self.took(store, key, &read, started.elapsed().as_secs_f64());
+        read
+    }
+
+    /// Counts a blob that was read, and keeps it.
+    fn took(&self, store: &Store, key: Key, read: &Read, seconds: f64) {
+        match read {
+            Ok(None) => {}
+            Ok(Some(blob)) => {
+                self.metrics.cache_misses.inc();
+                self.metrics.store_reads.inc();
+                self.metrics.store_read_bytes.inc_by(blob.len() as u64);
+                self.metrics.store_read_seconds.observe(seconds);
+                if let Some(cache) = &self.cache {
+                    cache.insert(name(store, key), blob.clone());
+                }
             }
+            Err(error) => self.failed(error),
         }
-        Ok(read)
+    }
+
+    /// Reads those of some blobs that are not kept, near ones together, where they come from an object store: afterwards
+    /// they are in `at_hand`, with what went wrong. Elsewhere it does nothing.
+    pub(super) async fn fetch(&self, store: &Store, keys: &[Key], at_hand: &mut HashMap<Key, Read>) {
+        if !store.is_remote() {
+            return;
+        }
+        let is_missing = |key: &Key| !at_hand.contains_key(key) && self.held(store, *key).is_none();
+        let missing: Vec<Key> = keys.iter().copied().filter(is_missing).collect();
+        if missing.is_empty() {
+            return;
+        }
+        let started = Instant::now();
+        let Some(blobs) = store.fetch(&missing).await else { return };
+        let seconds = started.elapsed().as_secs_f64();
+        for (key, read) in missing.into_iter().zip(blobs) {
+            self.took(store, key, &read, seconds);
+            at_hand.insert(key, read);
+        }
     }
 
     /// Counts a blob that could not be read.
     pub(super) fn failed(&self, error: &StoreError) {
-        if matches!(error, StoreError::Damaged { .. }) {
-            self.metrics.checksum_failures.inc();
-        } else {
-            self.metrics.store_errors.inc();
-        }
+        match error {
+            StoreError::Damaged { .. } => self.metrics.checksum_failures.inc(),
+            StoreError::Away { .. } => self.metrics.store_away.inc(),
+            _ => self.metrics.store_errors.inc(),
+        };
     }
 
     /// The blob of a key; `None` if there is none. Only who waits for the disk leaves the async thread.
@@ -104,6 +136,11 @@ impl Blobs {
         }
         if let Some(blob) = self.held(store, key) {
             return Ok(Some(blob));
+        }
+        let mut at_hand = HashMap::new();
+        self.fetch(store, &[key], &mut at_hand).await;
+        if let Some(read) = at_hand.remove(&key) {
+            return read;
         }
         let (blobs, at) = (Arc::clone(self), Arc::clone(store));
         match tokio::task::spawn_blocking(move || blobs.read(&at, key)).await {
@@ -132,7 +169,7 @@ mod tests {
 
     #[test]
     fn what_is_kept_stays_within_its_bytes_and_what_is_asked_for_stays() {
-        let blobs = Blobs::new(8 << 20, Arc::new(Metrics::new()));
+        let blobs = Blobs::new(8 << 20, Arc::new(Metrics::new(Arc::default())));
         let cache = blobs.cache.as_ref().unwrap();
         let blob = Bytes::from(vec![0; 10_000]);
         for number in 0..5000 {
@@ -153,6 +190,6 @@ mod tests {
 
     #[test]
     fn without_a_budget_nothing_is_kept() {
-        assert!(Blobs::new(0, Arc::new(Metrics::new())).cache.is_none());
+        assert!(Blobs::new(0, Arc::new(Metrics::new(Arc::default()))).cache.is_none());
     }
 }

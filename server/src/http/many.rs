@@ -3,12 +3,14 @@
 //! What is damaged comes last, in a frame that says so, and then the answer is cut off: whoever reads it has all the
 //! others, and no cache on the way keeps it.
 
-use super::blobs::Blobs;
+use super::answer::Refusal;
+use super::blobs::{Blobs, Read};
 use crate::inspect::InspectError;
-use crate::store::{Key, Kind, Store};
+use crate::store::{Key, Kind, Store, StoreError};
 use crate::stream::Stream;
 use axum::body::{Body, Bytes};
 use diamantina_protocol::message::{self, FrameHeader, PAYLOAD_BYTES_MAX, Status};
+use std::collections::HashMap;
 use std::io;
 use std::sync::Arc;
 use std::time::Duration;
@@ -18,6 +20,9 @@ const PIECE_BYTES: usize = 16 << 10;
 
 /// How long before it is cut off an answer with something damaged waits for its bytes to go out.
 const FAREWELL: Duration = Duration::from_millis(100);
+
+/// Diamonds of a batch that are asked of an object store at once.
+const AHEAD: usize = 64;
 
 /// A batch that is being read.
 pub(super) struct Batch {
@@ -34,16 +39,30 @@ struct Progress {
     next: usize,
     damaged: Vec<[u32; 2]>,
     last_error: Option<String>,
+    /// What an object store was asked for ahead.
+    at_hand: HashMap<Key, Read>,
 }
 
 /// The body of a batch.
-pub(super) fn batch(batch: Batch) -> Body {
-    let begun = Progress { batch, next: 0, damaged: Vec::new(), last_error: None };
-    Body::from_stream(futures_util::stream::unfold(Some(begun), |progress| async move {
+///
+/// # Errors
+/// When it comes from an object store that cannot be reached: then nothing has been sent, and 503 can be said.
+pub(super) async fn batch(batch: Batch) -> Result<Body, Refusal> {
+    let at_hand = HashMap::new();
+    let mut begun = Progress { batch, next: 0, damaged: Vec::new(), last_error: None, at_hand };
+    begun.fetch().await;
+    if begun.at_hand.values().any(|read| matches!(read, Err(StoreError::Away { .. }))) {
+        return Err(Refusal::away());
+    }
+    Ok(Body::from_stream(futures_util::stream::unfold(Some(begun), |progress| async move {
         let mut progress = progress?;
         // What is in memory needs no thread.
         let mut piece = Vec::new();
         progress.fill(&mut piece, false);
+        if piece.is_empty() && !progress.is_over() && progress.batch.store.is_remote() {
+            progress.fetch().await;
+            progress.fill(&mut piece, false);
+        }
         if piece.is_empty() && !progress.is_over() {
             let filled = tokio::task::spawn_blocking(move || {
                 progress.fill(&mut piece, true);
@@ -67,10 +86,21 @@ pub(super) fn batch(batch: Batch) -> Body {
         // What was written goes out before the connection is dropped.
         tokio::time::sleep(FAREWELL).await;
         Some((Err(io::Error::other(error)), None))
-    }))
+    })))
 }
 
 impl Progress {
+    fn key(&self, [a, b]: [u32; 2]) -> Key {
+        Key { layer: self.batch.layer, kind: self.batch.kind, a, b }
+    }
+
+    /// Asks an object store for those that come next.
+    async fn fetch(&mut self) {
+        let next = self.batch.centres.iter().skip(self.next).take(AHEAD);
+        let keys: Vec<Key> = next.map(|centre| self.key(*centre)).collect();
+        self.batch.blobs.fetch(&self.batch.store, &keys, &mut self.at_hand).await;
+    }
+
     fn is_over(&self) -> bool {
         self.next == self.batch.centres.len()
     }
@@ -80,11 +110,14 @@ impl Progress {
         let Batch { blobs, store, layer, kind, centres } = &self.batch;
         while let Some(centre) = centres.get(self.next).filter(|_| piece.len() < PIECE_BYTES) {
             let key = Key { layer: *layer, kind: *kind, a: centre[0], b: centre[1] };
-            let blob = match (blobs.held(store, key), may_wait) {
-                (Some(blob), _) => Ok(Some(blob)),
-                (None, _) if !store.has(key) => Ok(None),
-                (None, true) => blobs.read(store, key),
-                (None, false) => return,
+            let blob = match (self.at_hand.remove(&key), may_wait) {
+                (Some(read), _) => read,
+                (None, may_wait) => match (blobs.held(store, key), may_wait) {
+                    (Some(blob), _) => Ok(Some(blob)),
+                    (None, _) if !store.has(key) => Ok(None),
+                    (None, true) => blobs.read(store, key),
+                    (None, false) => return,
+                },
             };
             self.next += 1;
             match blob {
@@ -98,6 +131,11 @@ impl Progress {
                     self.damaged.push(*centre);
                     self.last_error = Some(format!("{key:?} is larger than any payload"));
                 }
+                // What is to come is there, though not now: cut off, the answer is asked for again.
+                Err(error @ StoreError::Away { .. }) => {
+                    self.next = centres.len();
+                    self.last_error = Some(error.to_string());
+                }
                 Err(error) => {
                     self.damaged.push(*centre);
                     self.last_error = Some(error.to_string());
@@ -109,13 +147,28 @@ impl Progress {
 
 /// The body of a stream. Each piece is made when the one before has gone out, on a thread that it leaves at once: a
 /// slow reader keeps what the stream remembers and one piece, and no thread.
-pub(super) fn stream(stream: Stream, blobs: &Arc<Blobs>) -> Body {
-    let begun = (stream, Arc::clone(blobs));
-    Body::from_stream(futures_util::stream::unfold(Some(begun), |begun| async move {
-        let (mut stream, blobs) = begun?;
-        let made = tokio::task::spawn_blocking(move || (stream.next_piece(PIECE_BYTES), stream)).await;
+///
+/// # Errors
+/// As [`batch`].
+pub(super) async fn stream(stream: Stream, blobs: &Arc<Blobs>, is_remote: bool) -> Result<Body, Refusal> {
+    let mut begun = (stream, Arc::clone(blobs), None);
+    if is_remote {
+        let (stream, blobs, _) = begun;
+        let made = make(stream).await;
+        if let Ok((Err(InspectError::Store(StoreError::Away { .. })), _)) = made {
+            return Err(Refusal::away());
+        }
+        let Ok((piece, stream)) = made else { return Ok(Body::empty()) };
+        begun = (stream, blobs, Some(piece));
+    }
+    Ok(Body::from_stream(futures_util::stream::unfold(Some(begun), |begun| async move {
+        let (stream, blobs, first) = begun?;
+        let made = match first {
+            Some(piece) => Ok((piece, stream)),
+            None => make(stream).await,
+        };
         match made {
-            Ok((Ok(piece), stream)) => piece.map(|piece| (Ok(piece), Some((stream, blobs)))),
+            Ok((Ok(piece), stream)) => piece.map(|piece| (Ok(piece), Some((stream, blobs, None)))),
             // The answer is cut off, so that the reader knows.
             Ok((Err(error), _)) => {
                 tokio::time::sleep(FAREWELL).await;
@@ -126,5 +179,12 @@ pub(super) fn stream(stream: Stream, blobs: &Arc<Blobs>) -> Body {
             }
             Err(error) => Some((Err(io::Error::other(error)), None)),
         }
-    }))
+    })))
+}
+
+type Made = (Result<Option<Bytes>, InspectError>, Stream);
+
+/// The next piece, by a thread that may wait.
+async fn make(mut stream: Stream) -> Result<Made, tokio::task::JoinError> {
+    tokio::task::spawn_blocking(move || (stream.next_piece(PIECE_BYTES), stream)).await
 }

@@ -3,17 +3,19 @@
 //! Labels have few values, whoever asks for what: routes are templates, and no name, version or token of a scene is one.
 
 use super::Site;
+use crate::store::Shared;
 use axum::extract::State;
 use axum::http::header;
 use axum::response::IntoResponse;
 use prometheus_client::encoding::{DescriptorEncoder, EncodeLabelSet, EncodeMetric};
-use prometheus_client::metrics::counter::Counter;
+use prometheus_client::metrics::counter::{ConstCounter, Counter};
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::{ConstGauge, Gauge};
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::Registry;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 /// What answers that no route gave are counted under.
@@ -63,14 +65,17 @@ pub(super) struct Metrics {
     pub(super) store_read_bytes: Counter,
     pub(super) store_read_seconds: Histogram,
     pub(super) store_errors: Counter,
+    pub(super) store_away: Counter,
     pub(super) checksum_failures: Counter,
+    pub(super) stores_away: Gauge,
     pub(super) scenes: Gauge,
     pub(super) swaps: Counter,
     pub(super) swaps_refused: Counter,
 }
 
 impl Metrics {
-    pub(super) fn new() -> Self {
+    /// Counts, and tells what stores count of what they share.
+    pub(super) fn new(shared: Arc<Shared>) -> Self {
         let mut registry = Registry::with_prefix("diamantina");
         let metrics = Self {
             registry: Registry::default(),
@@ -89,6 +94,8 @@ impl Metrics {
             store_read_bytes: Counter::default(),
             store_read_seconds: seconds(),
             store_errors: Counter::default(),
+            store_away: Counter::default(),
+            stores_away: Gauge::default(),
             checksum_failures: Counter::default(),
             scenes: Gauge::default(),
             swaps: Counter::default(),
@@ -116,15 +123,22 @@ impl Metrics {
         r.register("store_read_seconds", "How long a blob took to read", m.store_read_seconds.clone());
         r.register("store_errors", "Blobs that could not be read", m.store_errors.clone());
         r.register(
+            "store_away",
+            "Blobs that could not be had since their object store could not be reached",
+            m.store_away.clone(),
+        );
+        r.register(
             "checksum_failures",
             "Blobs that did not match their checksum",
             m.checksum_failures.clone(),
         );
+        r.register("stores_away", "Scenes whose object store cannot be reached now", m.stores_away.clone());
         r.register("scenes", "Scenes served", m.scenes.clone());
         r.register("swaps", "Times that another version of a scene took over", m.swaps.clone());
         r.register("swaps_refused", "Published versions that were not sound", m.swaps_refused.clone());
         r.register("build", "This program", Info::new(vec![("version", env!("CARGO_PKG_VERSION"))]));
         registry.register_collector(Box::new(Process::new()));
+        registry.register_collector(Box::new(Objects(shared)));
         Self { registry, ..metrics }
     }
 
@@ -143,6 +157,38 @@ impl Metrics {
     /// A connection or a request was refused for a limit.
     pub(super) fn rejected(&self, reason: &'static str) {
         self.rejections.get_or_create(&Why { reason }).inc();
+    }
+}
+
+/// What remote stores count, read at each scrape.
+#[derive(Debug)]
+struct Objects(Arc<Shared>);
+
+impl prometheus_client::collector::Collector for Objects {
+    fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> Result<(), std::fmt::Error> {
+        let counts = &self.0.counts;
+        let counters = [
+            ("object_requests", "Ranges asked of object stores", &counts.requests),
+            ("object_bytes", "Bytes of these", &counts.bytes),
+            ("object_failures", "Ranges that could not be had", &counts.failures),
+            ("object_rereads", "Blobs asked for again for their checksum", &counts.rereads),
+            ("disk_cache_hits", "Pieces of packs found in the disk cache", &counts.disk_hits),
+            ("disk_cache_misses", "Pieces of packs not found there", &counts.disk_misses),
+        ];
+        for (name, help, count) in counters {
+            let counter = ConstCounter::new(count.load(Ordering::Relaxed));
+            counter.encode(encoder.encode_descriptor(name, help, None, counter.metric_type())?)?;
+        }
+        if let Some(disk) = &self.0.disk {
+            let gauge = ConstGauge::new(disk.bytes()[0]);
+            gauge.encode(encoder.encode_descriptor(
+                "disk_cache_bytes",
+                "Bytes in the disk cache",
+                None,
+                gauge.metric_type(),
+            )?)?;
+        }
+        Ok(())
     }
 }
 
@@ -191,6 +237,8 @@ impl prometheus_client::collector::Collector for Process {
 pub(super) async fn metrics(State(site): State<Arc<Site>>) -> impl IntoResponse {
     site.blobs.measure();
     site.metrics.scenes.set(i64::try_from(site.scenes.all().len()).unwrap_or(i64::MAX));
+    let away = site.scenes.all().iter().filter(|store| store.away().is_some()).count();
+    site.metrics.stores_away.set(i64::try_from(away).unwrap_or(i64::MAX));
     let mut text = String::new();
     // Writing to a string does not fail.
     let _ = prometheus_client::encoding::text::encode(&mut text, &site.metrics.registry);

@@ -11,6 +11,7 @@ use crate::height::{self, HeightError};
 use crate::store::{Key, Kind, Store, zones};
 use crate::stream::Stream;
 use axum::Router;
+use axum::body::Body;
 use axum::extract::{Path, Query, State};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::middleware::map_response;
@@ -74,7 +75,7 @@ fn lines() -> Vec<Line> {
     vec![
         ("/", about("What there is, for people", Holds::Html), get(front_page)),
         ("/health", about("Whether the server answers", Holds::Text), well()),
-        ("/ready", about("Whether it will go on", Holds::Text), well()),
+        ("/ready", about("Whether it will go on", Holds::Text), get(ready)),
         ("/metrics", about("What was counted", Holds::Metrics), get(metrics)),
         ("/scenes", about("All scenes", Holds::Json), get(catalogue)),
         (
@@ -123,6 +124,21 @@ pub(super) fn router(site: Arc<Site>) -> Router {
             ([(header::ALLOW, "GET, HEAD, OPTIONS")], refusal)
         })
         .with_state(site)
+}
+
+/// That the server can do its work. Where an object store cannot be reached it says so, but does not ask to be taken out:
+/// all servers of that store would be, and none would be left for what they have in memory.
+async fn ready(State(site): State<Arc<Site>>) -> Response {
+    let stores = site.scenes.all();
+    let away: Vec<_> = stores.iter().filter_map(|store| store.away()).collect();
+    let text = away.iter().max().map_or_else(
+        || "ok\n".to_owned(),
+        |longest| {
+            let (scenes, seconds) = (away.len(), longest.as_secs());
+            format!("ok, but the object stores of {scenes} scenes cannot be reached, for {seconds} s by now: only what is cached is served of them\n")
+        },
+    );
+    ([(header::CACHE_CONTROL, "no-store")], text).into_response()
 }
 
 async fn front_page(State(site): State<Arc<Site>>, caller: Caller) -> Html<String> {
@@ -254,7 +270,9 @@ fn batches(encoding: Find) -> Methods {
               caller: Caller,
               path: BatchPath,
               query: Ask,
-              headers: HeaderMap| async move { batch_of(&site, caller, path, &query, &headers, encoding) },
+              headers: HeaderMap| async move {
+            batch_of(&site, caller, path, &query, &headers, encoding).await
+        },
     )
 }
 
@@ -317,7 +335,7 @@ fn question(text: &str) -> String {
     blake3::hash(text.as_bytes()).to_hex()[..16].to_owned()
 }
 
-fn batch_of(
+async fn batch_of(
     site: &Site,
     caller: Caller,
     Path((name, version, layer)): BatchPath,
@@ -347,7 +365,11 @@ fn batch_of(
     let tag = format!("{version}-{number}-{}b{}", letters[0], question(list));
     let blobs = Arc::clone(&site.blobs);
     let batch = Batch { blobs, store, layer: number, kind: payload, centres };
-    Ok(tagged(headers, &tag, cache, OCTETS, || many::batch(batch)))
+    let mut response = tagged(headers, &tag, cache, OCTETS, Body::empty);
+    if response.status() == StatusCode::OK {
+        *response.body_mut() = many::batch(batch).await?;
+    }
+    Ok(response)
 }
 
 async fn stream(
@@ -364,7 +386,11 @@ async fn stream(
         .map_err(|e| Refusal::new(StatusCode::BAD_REQUEST, e.to_string()))?;
     let tag = format!("{version}-{number}-s{}", question(&message::stream_route("", "", "", &ask)));
     let stream = Stream::new(Arc::clone(&store), number, layer, ask, STREAM_MAX);
-    Ok(tagged(&headers, &tag, cache, OCTETS, || many::stream(stream, &site.blobs)))
+    let mut response = tagged(&headers, &tag, cache, OCTETS, Body::empty);
+    if response.status() == StatusCode::OK {
+        *response.body_mut() = many::stream(stream, &site.blobs, store.is_remote()).await?;
+    }
+    Ok(response)
 }
 
 async fn height_at(

@@ -6,7 +6,7 @@
 
 use super::ServeError;
 use super::metrics::Metrics;
-use crate::store::{Store, StoreError};
+use crate::store::{Shared, Store, StoreError};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::{Arc, PoisonError, RwLock};
@@ -37,10 +37,10 @@ pub(super) enum Found {
 
 impl Scenes {
     /// Opens the stores.
-    pub(super) fn open(stores: &[PathBuf]) -> Result<Self, ServeError> {
+    pub(super) fn open(stores: &[PathBuf], shared: &Arc<Shared>) -> Result<Self, ServeError> {
         let mut scenes: BTreeMap<String, Shown> = BTreeMap::new();
         for path in stores {
-            let store = Store::open(path)?;
+            let store = Store::open_sharing(path, shared)?;
             let name = store.scene().name.clone();
             if let Some(first) = scenes.get(&name) {
                 let (first, second) = (first.now.root().to_owned(), path.clone());
@@ -99,9 +99,11 @@ impl Scenes {
                 metrics.swaps_refused.inc();
                 self.change(name, |shown| shown.refused = Some((version.to_owned(), Instant::now())));
             };
-            let version = match Store::published(store.root()) {
-                Ok(version) if version == store.scene().version => continue,
-                Ok(version) => version,
+            let version = match store.newer() {
+                Ok(None) => continue,
+                Ok(Some(version)) => version,
+                // That is told elsewhere, and says nothing of what is published.
+                Err(StoreError::Away { .. }) => continue,
                 Err(error) => {
                     self.refuse_once(name, "", || refuse("", &error));
                     continue;
@@ -139,9 +141,14 @@ impl Scenes {
     }
 }
 
-/// What is published where a store is from, if every blob of it is as it was written.
+/// What is published where a store is from, if every blob of it is as it was written. From an object store not all of it
+/// is read, only a blob of each pack: it was published by something that had checked, and costs by the request.
 fn sound(store: &Store) -> Result<Store, StoreError> {
-    let newer = Store::open(store.root())?;
+    let newer = store.reopen()?;
+    if newer.is_remote() {
+        newer.probe()?;
+        return Ok(newer);
+    }
     let keys: Vec<_> = newer.keys().map(|(key, _)| key).collect();
     for key in keys {
         newer.get(key)?;

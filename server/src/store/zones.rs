@@ -6,8 +6,8 @@
 //! kill leaves the old version or the new one.
 
 use super::{
-    BLOB_BYTES_MAX, Key, Kind, Manifest, Place, Store, StoreError, io_at, lock, make_current, pack_name,
-    write_synced,
+    BLOB_BYTES_MAX, Key, Kind, Manifest, Place, Source, Store, StoreError, folder, io_at, is_address, lock,
+    make_current, pack_name, write_synced,
 };
 use bytes::Bytes;
 use diamantina_protocol::message::Scene;
@@ -38,6 +38,14 @@ impl Zones {
     /// # Errors
     /// When there is no store, it is damaged, or something else writes it.
     pub fn open(root: &Path) -> Result<Self, StoreError> {
+        if is_address(root) {
+            return Err(StoreError::Address {
+                address: root.to_string_lossy().into_owned(),
+                reason: "zones are added in a folder: add them there, then `diamantina-server publish` it"
+                    .to_owned(),
+            });
+        }
+        let root = folder(root);
         // Before anything is left in a folder that is none.
         Manifest::read(root)?;
         let lock = lock(root)?;
@@ -79,7 +87,10 @@ impl Zones {
         let mut entries: Vec<(Key, Place)> = kept.map(|(key, place)| (*key, *place)).collect();
         let packs = entries.iter().map(|(_, place)| place.pack as usize + 1).max().unwrap_or(0);
         let mut pack_bytes = Vec::with_capacity(packs + 1);
-        for (i, (path, file)) in self.store.packs.iter().take(packs).enumerate() {
+        let Source::Packs(files) = &self.store.source else {
+            return Err(StoreError::NotAStore(root.to_owned()));
+        };
+        for (i, (path, file)) in files.iter().take(packs).enumerate() {
             let to = data.join(pack_name(i));
             // A file system without links gets a copy.
             fs::hard_link(path, &to)

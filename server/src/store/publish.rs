@@ -1,0 +1,240 @@
+//! A built store put into an object store.
+//!
+//! Packs and the directory go first, under the version's own name; `scene.json` comes last, by a conditional put: only if
+//! what is published there is still what was there when the publisher was opened. So a kill leaves the scene before, two
+//! publishers cannot overwrite each other unseen, and publishing again sends what is missing: what is there with the right
+//! size and hash is not sent again. Versions before stay, since servers may still be at them, until they are pruned.
+
+use super::objects::{Failure, Manner, Objects, runtime};
+use super::{Manifest, SCENE_BYTES_MAX, SCENE_FILE, StoreError, folder, io_at, is_version, pack_name};
+use bytes::Bytes;
+use diamantina_protocol::message::Scene;
+use futures_util::TryStreamExt;
+use object_store::{
+    Attribute, Attributes, GetOptions, ObjectStoreExt, PutMode, PutMultipartOptions, PutOptions,
+    UpdateVersion, WriteMultipart,
+};
+use std::fs;
+use std::path::Path;
+
+/// What is larger goes in parts, each of which can be tried again alone.
+const PART_BYTES: usize = 8 << 20;
+
+/// Parts that are sent at once.
+const PARTS_AT_ONCE: usize = 4;
+
+/// The attribute that says what an object holds.
+const HASH: &str = "blake3";
+
+/// Bytes of an object without the attribute that are read at once, to find out.
+const PIECE_BYTES: u64 = 8 << 20;
+
+/// What publishing did.
+#[derive(Debug, Clone)]
+pub struct Published {
+    /// The scene.
+    pub scene: Scene,
+    /// Bytes that were sent.
+    pub sent: u64,
+    /// Bytes that were there already.
+    pub kept: u64,
+    /// Objects of other versions that were removed.
+    pub pruned: u64,
+}
+
+/// The right to replace what was published at an address when this was opened, and nothing else.
+#[derive(Debug)]
+pub struct Publisher {
+    objects: Objects,
+    before: Option<UpdateVersion>,
+}
+
+impl Publisher {
+    /// Looks at what is published at an address.
+    ///
+    /// # Errors
+    /// When the address is none, or the store cannot be reached or does not let us.
+    pub fn open(address: &Path) -> Result<Self, StoreError> {
+        Self::of(Objects::open(address, Manner::Publishing)?)
+    }
+
+    fn of(objects: Objects) -> Result<Self, StoreError> {
+        let before = match runtime()?.block_on(objects.read(SCENE_FILE, SCENE_BYTES_MAX)) {
+            Ok(thing) => Some(thing.version),
+            Err(Failure::Missing) => None,
+            Err(failure) => return Err(failure.at(objects.address(SCENE_FILE))),
+        };
+        Ok(Self { objects, before })
+    }
+
+    /// Bytes of what a store holds, for progress.
+    ///
+    /// # Errors
+    /// When there is no store.
+    pub fn bytes(root: &Path) -> Result<u64, StoreError> {
+        Ok(Manifest::read(folder(root))?.pack_bytes.iter().sum())
+    }
+
+    /// Publishes the store in a folder; `None` if `go_on`, asked before each object with the bytes of the one before, said
+    /// no. With `prune`, versions but this one and the one before are removed then.
+    ///
+    /// # Errors
+    /// When the folder holds no store, the object store fails, or somebody else has published there
+    /// ([`StoreError::Overtaken`]): what is published is then as it was.
+    pub fn publish(
+        &self,
+        root: &Path,
+        prune: bool,
+        go_on: impl Fn(u64) -> bool,
+    ) -> Result<Option<Published>, StoreError> {
+        let root = folder(root);
+        let manifest = Manifest::read(root)?;
+        let version = manifest.scene.version.clone();
+        let names = (0..manifest.pack_bytes.len()).map(pack_name).chain(["directory".to_owned()]);
+        let (mut sent, mut kept, mut last) = (0, 0, 0);
+        for name in names {
+            if !go_on(last) {
+                return Ok(None);
+            }
+            let path = root.join(&version).join(&name);
+            let bytes = Bytes::from(fs::read(&path).map_err(io_at("read", &path))?);
+            last = bytes.len() as u64;
+            let below = format!("{version}/{name}");
+            let put = runtime()?.block_on(put(&self.objects, &below, bytes));
+            match put.map_err(|failure| failure.at(self.objects.address(&below)))? {
+                true => sent += last,
+                false => kept += last,
+            }
+        }
+        if !go_on(last) {
+            return Ok(None);
+        }
+        let path = root.join(SCENE_FILE);
+        let text = Bytes::from(fs::read(&path).map_err(io_at("read", &path))?);
+        let before = runtime()?
+            .block_on(self.make_current(text))
+            .map_err(|failure| failure.at(self.objects.address(SCENE_FILE)))?;
+        let pruned = if prune {
+            let keep = [version, before.unwrap_or_default()];
+            runtime()?.block_on(self.prune(&keep)).map_err(|failure| failure.at(self.objects.address("")))?
+        } else {
+            0
+        };
+        Ok(Some(Published { scene: manifest.scene, sent, kept, pruned }))
+    }
+
+    /// Replaces the description; the version that was there before.
+    async fn make_current(&self, text: Bytes) -> Result<Option<String>, Failure> {
+        let version = |text: &[u8]| {
+            Manifest::parse(text, Path::new(SCENE_FILE), Path::new(SCENE_FILE)).ok().map(|m| m.scene.version)
+        };
+        let before = match self.objects.read(SCENE_FILE, SCENE_BYTES_MAX).await {
+            Ok(thing) if thing.bytes == text => return Ok(version(&text)),
+            Ok(thing) => version(&thing.bytes),
+            Err(Failure::Missing) => None,
+            Err(failure) => return Err(failure),
+        };
+        let attributes = Attributes::from_iter([
+            (Attribute::ContentType, "application/json"),
+            (Attribute::CacheControl, "no-cache"),
+        ]);
+        let mode = self.before.clone().map_or(PutMode::Create, PutMode::Update);
+        let options = PutOptions { mode, attributes, ..PutOptions::default() };
+        let name = self.objects.name(SCENE_FILE);
+        let put = self
+            .objects
+            .ask(async { self.objects.store().put_opts(&name, text.clone().into(), options).await })
+            .await;
+        match put {
+            Ok(_) => Ok(before),
+            // Where the answer to a put was lost and it was tried again, it is ours that is there.
+            Err(Failure::Changed) => match self.objects.read(SCENE_FILE, SCENE_BYTES_MAX).await {
+                Ok(thing) if thing.bytes == text => Ok(before),
+                _ => Err(Failure::Changed),
+            },
+            Err(failure) => Err(failure),
+        }
+    }
+
+    /// Removes all versions but these; how many objects went.
+    async fn prune(&self, keep: &[String]) -> Result<u64, Failure> {
+        let (store, root) = (self.objects.store(), self.objects.name(""));
+        let listed = self.objects.ask(async { store.list_with_delimiter(Some(&root)).await }).await?;
+        let mut pruned = 0;
+        for prefix in listed.common_prefixes {
+            let name = prefix.filename().unwrap_or_default();
+            if !is_version(name) || keep.iter().any(|version| version == name) {
+                continue;
+            }
+            pruned += self
+                .objects
+                .ask(async {
+                    let objects: Vec<_> = store.list(Some(&prefix)).try_collect().await?;
+                    for object in &objects {
+                        store.delete(&object.location).await?;
+                    }
+                    Ok(objects.len() as u64)
+                })
+                .await?;
+        }
+        Ok(pruned)
+    }
+}
+
+/// Makes sure that there is an object with this content; whether it had to be sent.
+pub(super) async fn put(objects: &Objects, below: &str, bytes: Bytes) -> Result<bool, Failure> {
+    let hash = blake3::hash(&bytes).to_hex().to_string();
+    if is_there(objects, below, bytes.len() as u64, &hash).await? {
+        return Ok(false);
+    }
+    let name = objects.name(below);
+    let attributes = Attributes::from_iter([
+        (Attribute::ContentType, "application/octet-stream".to_owned()),
+        (Attribute::CacheControl, "public, max-age=31536000, immutable".to_owned()),
+        (Attribute::Metadata(HASH.into()), hash),
+    ]);
+    let store = objects.store();
+    objects
+        .ask(async {
+            if bytes.len() <= PART_BYTES {
+                let options = PutOptions { attributes, ..PutOptions::default() };
+                return store.put_opts(&name, bytes.into(), options).await.map(drop);
+            }
+            let options = PutMultipartOptions { attributes, ..PutMultipartOptions::default() };
+            let upload = store.put_multipart_opts(&name, options).await?;
+            let mut parts = WriteMultipart::new_with_chunk_size(upload, PART_BYTES);
+            let mut rest = bytes;
+            while !rest.is_empty() {
+                if let Err(error) = parts.wait_for_capacity(PARTS_AT_ONCE).await {
+                    // Its parts would be kept, and paid for.
+                    let _ = parts.abort().await;
+                    return Err(error);
+                }
+                parts.put(rest.split_to(PART_BYTES.min(rest.len())));
+            }
+            parts.finish().await.map(drop)
+        })
+        .await?;
+    Ok(true)
+}
+
+/// Whether there is an object with this content.
+async fn is_there(objects: &Objects, below: &str, size: u64, hash: &str) -> Result<bool, Failure> {
+    let name = objects.name(below);
+    let options = GetOptions::new().with_head(true);
+    let looked = objects.ask(async { objects.store().get_opts(&name, options).await }).await;
+    let found = match looked {
+        Ok(found) => found,
+        Err(Failure::Missing) => return Ok(false),
+        Err(failure) => return Err(failure),
+    };
+    if found.meta.size != size {
+        return Ok(false);
+    }
+    if let Some(told) = found.attributes.get(&Attribute::Metadata(HASH.into())) {
+        return Ok(told.as_ref() == hash);
+    }
+    // Somebody else's tool has put it there.
+    let bytes = objects.read_long(below, PIECE_BYTES).await?;
+    Ok(blake3::hash(&bytes).to_hex().as_str() == hash)
+}
