@@ -100,7 +100,7 @@ fn an_observer_hardly_notices_that_nine_tenths_of_the_polygons_are_gone() {
     let Some(sources) = sources(&["srtm3_crops/alps_1025.tif"]) else { return };
     let report = run("curvature", &sources, &["--samples", "513"]);
     let table = &report.tables[0];
-    let row = |rule: &str, share: &str| table.rows.iter().find(|r| r[1] == rule && r[2] == share).unwrap();
+    let row = |rule: &str, share: &str| table.rows.iter().find(|r| r[3] == rule && r[4] == share).unwrap();
     assert!(number(table, row("view and mask", "10"), "share [%]") <= 10.0);
     assert!(number(table, row("view and mask", "10"), "pixels changed [%]") < 1.0);
     let changed = |rule: &str| number(table, row(rule, "5"), "pixels changed [%]");
@@ -125,7 +125,7 @@ fn a_mask_leaves_less_than_a_third_of_the_triangles_and_the_skyline() {
     let report = run("zone", &sources, &["--samples", "1025", "--eye", "3", "--tolerances", "0.5"]);
     let table = report.tables.iter().find(|t| t.name == "zone").unwrap();
     for (mesh, tolerance, left) in [("curvature quadtree", "(50 %", 20.0), ("bitree", "(0.5 %", 15.0)] {
-        let row = table.rows.iter().find(|r| r[1] == mesh && r[2].contains(tolerance)).unwrap();
+        let row = table.rows.iter().find(|r| r[3] == mesh && r[4].contains(tolerance)).unwrap();
         assert!(number(table, row, "left [%]") <= left, "{row:?}");
         assert!(number(table, row, "skyline moved by the mask [px]") <= 1.0, "{row:?}");
         assert!(number(table, row, "places under the masked mesh") <= 3.0, "{row:?}");

@@ -24,8 +24,10 @@ const DIRECTIONS: u32 = 6;
 /// Halvings of the interval of a threshold's logarithm; the last are finer than any polygon.
 const BISECTIONS: usize = 40;
 
-const COLUMNS: [&str; 9] = [
+const COLUMNS: [&str; 11] = [
     "DEM",
+    "x",
+    "y",
     "rule",
     "share asked [%]",
     "threshold T",
@@ -84,7 +86,8 @@ fn one(
         Rule { name: "view and mask", sums: Sums::new(field, Some(&mask)), observer: Some(observer) },
     ];
     let mut series = Vec::new();
-    pictures.push(png(format!("{number}-full.png"), "All polygons, from the observer's place", &full)?);
+    let about = format!("{}: all polygons, from the observer's place", window.label());
+    pictures.push(png(format!("{number}-full.png"), &about, &full)?);
     for rule in &rules {
         let mut points = Vec::new();
         for share in SHARES {
@@ -96,8 +99,9 @@ fn one(
             let seen = view::render(field, &surface, eye);
             let [changed, mean] = view::difference(&full, &seen);
             let polygons = mesh.len() as f64 / full_polygons(field) * 100.0;
-            let row =
-                [window.source.clone(), rule.name.to_owned(), share.to_string(), format!("{threshold:.4e}")];
+            let [x, y] = window.at.map(|w| w.to_string());
+            let rule_is = [rule.name.to_owned(), share.to_string(), format!("{threshold:.4e}")];
+            let row = [window.source.clone(), x, y].into_iter().chain(rule_is);
             let rms = rms(field, &surface);
             let cells = [
                 format!("{polygons:.2}"),
@@ -105,12 +109,13 @@ fn one(
                 format!("{changed:.2}"),
                 format!("{mean:.2}"),
             ];
-            table.push(row.into_iter().chain([mesh.len().to_string()]).chain(cells));
+            table.push(row.chain([mesh.len().to_string()]).chain(cells));
             points.push([polygons, changed]);
             if PICTURED.contains(&share) {
                 let name = format!("{number}-{}-{share}", rule.name.replace(' ', "-"));
                 let about = format!(
-                    "{} rule, {polygons:.1} % of the polygons: {changed:.2} % of the pixels change",
+                    "{}, {} rule, {polygons:.1} % of the polygons: {changed:.2} % of the pixels change",
+                    window.label(),
                     rule.name
                 );
                 pictures.push(png(format!("{name}.png"), &about, &seen)?);
@@ -127,7 +132,7 @@ fn one(
         series.push(plot::Series { name: rule.name.to_owned(), points });
     }
     let axes = ["polygons [% of the full grid]", "pixels changed [%]"];
-    let bytes = plot::lines(&format!("{}: what the observer notices", window.source), axes, false, &series)?;
+    let bytes = plot::lines(&format!("{}: what the observer notices", window.label()), axes, false, &series)?;
     pictures.push(Picture {
         file: format!("{number}-pixels.svg"),
         caption: "Pixels against polygons".to_owned(),

@@ -40,7 +40,7 @@ pub struct Options {
     #[command(flatten)]
     pub(crate) windows: windows::Options,
     /// `tolerances`, `strips`, `zone`: tolerances, percent of each window's relief
-    #[arg(long, value_delimiter = ',', default_values_t = [0.0, 1.0, 2.0, 7.0, 10.0, 14.0, 50.0], value_name = "PERCENT")]
+    #[arg(long, value_delimiter = ',', default_values_t = [0.0, 1.0, 2.0, 7.0, 10.0, 14.0, 50.0], value_name = "PERCENT", allow_negative_numbers = true)]
     pub(crate) tolerances: Vec<f64>,
     /// `tolerances`: also bitrees of these numbers of points, the four corners included, the largest errors first
     #[arg(long, value_delimiter = ',', value_name = "N")]

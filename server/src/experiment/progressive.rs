@@ -1,14 +1,15 @@
 //! What a receiver has after each part of a progressive transmission: errors against points and bytes.
 //!
-//! Heights are whole units (1 m where all are whole metres, else 1 cm; ten, a hundred... times that where heights are
-//! beyond the 2^23 units that a source may have), and every scheme ends with exactly those.
+//! Heights are whole units, and every scheme ends with exactly those: 1 m where all are whole metres, else the power of
+//! ten below a hundred-thousandth of the relief, at most 1 cm, but so large that no height is beyond the 2^23 units that
+//! a source may have. Errors are against the heights as they were, so at the end up to half a unit.
 //!
 //! | scheme | order | bytes |
 //! |---|---|---|
 //! | `level` | the bitree's points off their means, level by level | batches |
 //! | `tolerance` | the bitree refined to half the tolerance again and again; what an earlier batch has stays | batches |
 //! | `error` | the bitree's worst triangle first, twice as many points a batch | batches |
-//! | `quadtree` | the points of `tolerance` with all that a restricted quadtree makes them depend on | batches |
+//! | `quadtree` | the restricted quadtree refined to the same tolerances; what an earlier batch has stays | batches |
 //! | `points midpoint`, `points smooth` | all points, level by level | the payloads of `protocol::points`, lossless, with the model that knows nothing of the layer |
 //! | `raster` | all at once | differences from the western neighbour, 2 bytes each where they fit, zstd |
 //!
@@ -24,7 +25,7 @@ use super::windows::Window;
 use super::{Criterion, ExperimentError, Run, plot, quadtree};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
-use diamantina_protocol::bitree::{Bitree, level};
+use diamantina_protocol::bitree::{Bitree, Facet, level};
 use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::points::{self, Coding, Rule};
 use std::collections::HashMap;
@@ -42,7 +43,8 @@ struct Step {
 }
 
 pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
-    let columns = ["DEM", "x", "y", "scheme", "points", "bytes", "largest error [m]", "RMS error [m]"];
+    let columns =
+        ["DEM", "x", "y", "unit [m]", "scheme", "points", "bytes", "largest error [m]", "RMS error [m]"];
     let mut table = Table::new("progressive", "After each part of the transmission", &columns);
     let mut pictures = Vec::new();
     run.progress.stage("transmitting", "windows", run.windows.len() as u64, 0);
@@ -50,35 +52,51 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
         if run.progress.is_stopping() {
             return Err(ExperimentError::Stopped);
         }
-        let schemes = schemes(window)?;
+        let (unit, schemes) = schemes(window)?;
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a handful of decimals")]
+        let decimals = (1.0 - unit.log10()).ceil().max(3.0) as usize;
         for (name, steps) in &schemes {
             for s in steps {
-                let place = [window.source.clone(), window.at[0].to_string(), window.at[1].to_string()];
+                let [x, y] = window.at.map(|w| w.to_string());
+                let place = [window.source.clone(), x, y, unit.to_string()];
                 let found = [
                     s.points.to_string(),
                     s.bytes.to_string(),
-                    format!("{:.3}", s.max),
-                    format!("{:.3}", s.rms),
+                    format!("{:.decimals$}", s.max),
+                    format!("{:.decimals$}", s.rms),
                 ];
                 table.push(place.into_iter().chain([(*name).to_owned()]).chain(found));
             }
         }
         if i == 0 {
-            pictures = plots(&window.source, &schemes)?;
+            pictures = plots(&window.label(), &schemes)?;
         }
         run.progress.advance(1);
     }
     let notes = vec![
-        "Plots are of the first window, with logarithms; the last step of each scheme, without error, has no place on them."
+        "Heights are sent in whole units; errors are against the heights as they were, so at the end up to half a unit."
             .to_owned(),
+        "Plots are of the first window, with logarithms; a step without error has no place on them.".to_owned(),
     ];
     Ok(Report { title: "Progressive transmission".to_owned(), notes, tables: vec![table], pictures })
 }
 
 type Scheme = (&'static str, Vec<Step>);
 
-fn schemes(window: &Window) -> Result<Vec<Scheme>, ExperimentError> {
-    let (field, unit) = whole_units(&window.field);
+/// A field as it is sent.
+struct Sent<'a> {
+    /// Heights in whole units.
+    field: Field,
+    /// Metres.
+    unit: f64,
+    /// Heights in metres, as they were.
+    source: &'a Field,
+}
+
+/// The unit, and the schemes by name.
+fn schemes(window: &Window) -> Result<(f64, Vec<Scheme>), ExperimentError> {
+    let sent = Sent::new(&window.field);
+    let field = &sent.field;
     if field.log2() < 3 {
         return Err(ExperimentError::Options {
             option: "--samples",
@@ -86,35 +104,58 @@ fn schemes(window: &Window) -> Result<Vec<Scheme>, ExperimentError> {
             found: field.row().to_string(),
         });
     }
-    let tolerances = by_tolerance(&field);
-    let closed: Vec<Bitree> = tolerances.iter().map(|tree| quadtree::close(&field, tree)).collect();
-    let bitrees = [
-        ("level", by_level(&field)),
+    let [tolerances, quadtrees] = by_tolerance(field);
+    let all = [
+        ("level", by_level(field)),
         ("tolerance", tolerances),
-        ("error", by_error(&field)),
-        ("quadtree", closed),
+        ("error", by_error(field)),
+        ("quadtree", quadtrees),
     ];
     let mut list: Vec<Scheme> = Vec::new();
-    for (name, trees) in bitrees {
-        list.push((name, batches(&field, unit, &trees)?));
+    for (name, trees) in all {
+        list.push((name, batches(&sent, &trees)?));
     }
-    list.push(("points midpoint", payloads(&field, unit, Rule::Midpoint)?));
-    list.push(("points smooth", payloads(&field, unit, Rule::Smooth)?));
-    let bytes = compress(&raster(&units(&field), field.row()))?.len();
-    list.push(("raster", vec![Step { points: field.samples(), bytes, max: 0.0, rms: 0.0 }]));
-    Ok(list)
+    list.push(("points midpoint", payloads(&sent, Rule::Midpoint)?));
+    list.push(("points smooth", payloads(&sent, Rule::Smooth)?));
+    let bytes = compress(&raster(&units(field), field.row()))?.len();
+    let [max, rms] = sent.errors(field.heights());
+    list.push(("raster", vec![Step { points: field.samples(), bytes, max, rms }]));
+    Ok((sent.unit, list))
 }
 
-/// The field with heights of whole units, and the unit in metres.
-fn whole_units(field: &Field) -> (Field, f64) {
-    let known = || field.heights().iter().filter(|h| !h.is_nan());
-    let mut unit = if known().all(|h| h.fract() == 0.0) { 1.0 } else { 0.01 };
-    let largest = known().fold(0.0f64, |most, h| most.max(h.abs()));
-    while (largest / unit).round() > f64::from(points::SOURCE_MAX) {
-        unit *= 10.0;
+impl<'a> Sent<'a> {
+    fn new(source: &'a Field) -> Self {
+        let known = || source.heights().iter().filter(|h| !h.is_nan());
+        #[allow(clippy::cast_possible_truncation, reason = "exponents of f64")]
+        let mut power = if known().all(|h| h.fract() == 0.0) {
+            0
+        } else {
+            // Level ground has no relief, and any unit will do that holds its height.
+            (1e-5 * source.relief()).log10().floor().clamp(-9.0, -2.0) as i32
+        };
+        let largest = known().fold(0.0f64, |most, h| most.max(h.abs()));
+        let ten = |power: i32| if power < 0 { 1.0 / 10f64.powi(-power) } else { 10f64.powi(power) };
+        while (largest / ten(power)).round() > f64::from(points::SOURCE_MAX) {
+            power += 1;
+        }
+        let unit = ten(power);
+        let heights = source.heights().iter().map(|h| (h / unit).round()).collect();
+        let field = Field::new(source.log2(), heights, source.cell()).unwrap_or_else(|| source.clone());
+        Self { field, unit, source }
     }
-    let heights = field.heights().iter().map(|h| (h / unit).round()).collect();
-    (Field::new(field.log2(), heights, field.cell()).unwrap_or_else(|| field.clone()), unit)
+
+    /// The largest and the RMS error, in metres, of a surface in units.
+    fn errors(&self, surface: &[f64]) -> [f64; 2] {
+        let apart = surface.iter().zip(self.source.heights()).map(|(s, h)| (self.unit * s - h).abs());
+        let known = apart.filter(|e| !e.is_nan());
+        let (max, squares, n) = known.fold((0.0f64, 0.0, 0u32), |(m, s, n), e| (m.max(e), s + e * e, n + 1));
+        [max, (squares / f64::from(n.max(1))).sqrt()]
+    }
+
+    fn step(&self, tree: &Bitree, bytes: usize) -> Step {
+        let [max, rms] = self.errors(&surface(&self.field, tree));
+        Step { points: tree.points().0, bytes, max, rms }
+    }
 }
 
 /// Heights as integers; the field has whole units.
@@ -145,15 +186,18 @@ fn by_level(field: &Field) -> Vec<Bitree> {
     trees
 }
 
-/// Refined to half the tolerance again and again, from the relief down to one unit, then to none.
-fn by_tolerance(field: &Field) -> Vec<Bitree> {
-    let Some(ground) = Ground::new(field, None) else { return Vec::new() };
-    let mut trees = vec![field.tree()];
+/// Bitrees and restricted quadtrees refined to half the tolerance again and again, from the relief down to one unit,
+/// then to none.
+fn by_tolerance(field: &Field) -> [Vec<Bitree>; 2] {
+    let Some(ground) = Ground::new(field, None) else { return [Vec::new(), Vec::new()] };
+    let mut trees = [vec![field.tree()], vec![field.tree()]];
     let mut tolerance = field.relief() / 2.0;
     while tolerance > 0.0 {
         tolerance = if tolerance < 1.0 { 0.0 } else { tolerance };
-        let before = trees[trees.len() - 1].clone();
-        trees.push(greedy(&ground, Criterion::Vertical, tolerance, GREEDY_SHARE, usize::MAX, before));
+        let [bitree, quadtree] = trees.each_ref().map(|list| list[list.len() - 1].clone());
+        trees[0].push(greedy(&ground, Criterion::Vertical, tolerance, GREEDY_SHARE, usize::MAX, bitree));
+        let error = |facet: &Facet, enough: f64| Criterion::Vertical.error(&ground, facet, enough);
+        trees[1].push(quadtree::complete(field, &quadtree, tolerance, error));
         tolerance /= 2.0;
     }
     trees
@@ -176,14 +220,14 @@ fn by_error(field: &Field) -> Vec<Bitree> {
 }
 
 /// The batches that lead from each selection to the next.
-fn batches(field: &Field, unit: f64, trees: &[Bitree]) -> Result<Vec<Step>, ExperimentError> {
+fn batches(sent: &Sent<'_>, trees: &[Bitree]) -> Result<Vec<Step>, ExperimentError> {
     let (mut steps, mut bytes) = (Vec::new(), 4 * CORNER_BYTES);
     let mut before: Option<&Bitree> = None;
     for tree in trees {
         if let Some(before) = before {
-            bytes += compress(&batch(field, before, tree))?.len();
+            bytes += compress(&batch(&sent.field, before, tree))?.len();
         }
-        steps.push(step(field, unit, tree, tree.points().0, bytes));
+        steps.push(sent.step(tree, bytes));
         before = Some(tree);
     }
     Ok(steps)
@@ -233,15 +277,9 @@ fn raster(heights: &[i32], row: usize) -> Vec<u8> {
     }
 }
 
-fn step(field: &Field, unit: f64, tree: &Bitree, points: usize, bytes: usize) -> Step {
-    let surface = surface(field, tree);
-    let errors = surface.iter().zip(field.heights()).map(|(s, h)| (s - h).abs()).filter(|e| !e.is_nan());
-    let (max, squares, n) = errors.fold((0.0f64, 0.0, 0u32), |(m, s, n), e| (m.max(e), s + e * e, n + 1));
-    Step { points, bytes, max: unit * max, rms: unit * (squares / f64::from(n.max(1))).sqrt() }
-}
-
 /// Level by level by the points encoding. The last level is checked to be the field itself.
-fn payloads(field: &Field, unit: f64, rule: Rule) -> Result<Vec<Step>, ExperimentError> {
+fn payloads(sent: &Sent<'_>, rule: Rule) -> Result<Vec<Step>, ExperimentError> {
+    let field = &sent.field;
     let patch_log2 = field.log2().saturating_sub(4).clamp(2, 6);
     let wrong = |e: &dyn std::fmt::Display| ExperimentError::Coding(format!("points encoding: {e}"));
     let forest = Forest::new(field.log2(), patch_log2, [1, 1]).map_err(|e| wrong(&e))?;
@@ -276,8 +314,7 @@ fn payloads(field: &Field, unit: f64, rule: Rule) -> Result<Vec<Step>, Experimen
                 tree.add(field.point(slot), *height);
             }
         }
-        let count = tree.points().0;
-        steps.push(step(field, unit, &tree, count, bytes));
+        steps.push(sent.step(&tree, bytes));
     }
     Ok(steps)
 }
@@ -327,15 +364,19 @@ mod tests {
             field,
             weights: None,
         };
-        // A height beyond 2^23 makes the unit ten metres.
-        let high = window.field.heights().iter().map(|h| h * 1e5).collect();
-        let high = Window { field: Field::new(5, high, [30.0, 30.0]).unwrap(), ..window.clone() };
-        for (name, steps) in schemes(&window).unwrap().into_iter().chain(schemes(&high).unwrap()) {
-            assert_eq!(steps.last().unwrap().max, 0.0, "{name}");
-            assert!(
-                steps.windows(2).all(|w| w[0].points <= w[1].points && w[0].bytes <= w[1].bytes),
-                "{name}"
-            );
+        // Heights beyond 2^23 m make the unit ten metres, and a relief of millimetres makes it finer.
+        for (times, unit_is, least) in [(1.0, 1.0, 0.0), (1e6, 10.0, 0.0), (1.0 / 3e3, 1e-7, 5e-8)] {
+            let heights = window.field.heights().iter().map(|h| h * times).collect();
+            let window = Window { field: Field::new(5, heights, [30.0, 30.0]).unwrap(), ..window.clone() };
+            let (unit, schemes) = schemes(&window).unwrap();
+            assert!(unit.to_bits() == f64::to_bits(unit_is), "{unit}");
+            for (name, steps) in schemes {
+                assert!(steps.last().unwrap().max <= least * (1.0 + 1e-6), "{times} {name}");
+                assert!(steps.first().unwrap().max > least || name == "raster", "{times} {name}");
+                let is_growing =
+                    steps.windows(2).all(|w| w[0].points <= w[1].points && w[0].bytes <= w[1].bytes);
+                assert!(is_growing, "{times} {name}");
+            }
         }
     }
 

@@ -67,6 +67,13 @@ pub struct Window {
     pub weights: Option<Vec<f32>>,
 }
 
+impl Window {
+    /// What tells it from other windows, for captions.
+    pub(super) fn label(&self) -> String {
+        format!("{} at {},{}", self.source, self.at[0], self.at[1])
+    }
+}
+
 /// The share of inner samples that are as high as their four neighbours.
 #[must_use]
 pub fn flat_share(field: &Field) -> f64 {

@@ -53,8 +53,10 @@ pub(crate) struct Options {
     pub(crate) spacing: Option<f64>,
 }
 
-const COLUMNS: [&str; 15] = [
+const COLUMNS: [&str; 17] = [
     "DEM",
+    "x",
+    "y",
     "mesh",
     "tolerance",
     "selected",
@@ -90,7 +92,7 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     let mut masks = Table::new(
         "masks",
         "What is seen from the zone",
-        &["DEM", "zone", "samples", "eyes", "in the zone [%]", "seen [%]", "hidden [%]"],
+        &["DEM", "x", "y", "zone", "samples", "eyes", "in the zone [%]", "seen [%]", "hidden [%]"],
     );
     let mut pictures = Vec::new();
     let mut notes = Vec::new();
@@ -98,7 +100,7 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
         match one(run, i, window, [&mut table, &mut masks], &mut pictures) {
             // Of many windows some have no lake.
             Err(ExperimentError::Options { option: "--polygon", found, .. }) if run.windows.len() > 1 => {
-                notes.push(format!("{} at {:?} is left out: {found}.", window.source, window.at));
+                notes.push(format!("{} is left out: {found}.", window.label()));
             }
             done => done?,
         }
@@ -106,7 +108,7 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     if table.rows.is_empty() {
         return Err(ExperimentError::Options {
             option: "--polygon",
-            expected: "a region, as no window has a lake".to_owned(),
+            expected: "a region given, as no window has a lake".to_owned(),
             found: format!("none for {} windows", run.windows.len()),
         });
     }
@@ -195,7 +197,8 @@ fn one(
         file: format!("{number}-mask.png"),
         caption: format!(
             "{}: bright is seen, dark is hidden, blue is the zone ({})",
-            window.source, region.name
+            window.label(),
+            region.name
         ),
         bytes: map::draw(field, &mask, &region.own).map_err(|e| ExperimentError::Plot(e.to_string()))?,
     });
@@ -247,8 +250,11 @@ fn told(window: &Window, region: &Region, mask: &[u8]) -> Vec<String> {
         format!("{:.1}", 100.0 * count as f64 / mask.len() as f64)
     };
     let least = mask.iter().copied().min().unwrap_or(0);
+    let [x, y] = window.at.map(|w| w.to_string());
     vec![
         window.source.clone(),
+        x,
+        y,
         region.name.clone(),
         mask.len().to_string(),
         region.eyes.len().to_string(),

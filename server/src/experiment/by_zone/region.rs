@@ -100,7 +100,7 @@ pub(super) fn from_lake(run: &Run<'_>, window: &Window, ground: &Ground) -> Resu
     if cells.len() < LAKE_CELLS_MIN {
         return Err(ExperimentError::Options {
             option: "--polygon",
-            expected: format!("a region, as the window of {} at {:?} has no lake", window.source, window.at),
+            expected: format!("a region given, as the window of {} has no lake", window.label()),
             found: format!("nothing, and {} level cells in one piece", cells.len()),
         });
     }

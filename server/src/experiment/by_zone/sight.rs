@@ -92,8 +92,9 @@ impl<'a> Sight<'a> {
         let pairs = [(&masked, &plain), (&plain, &self.full), (&masked, &self.full)];
         let counts = pair.meshes.each_ref().map(Vec::len);
         let left = 100.0 * counts[1] as f64 / counts[0].max(1) as f64;
-        let head =
-            [self.window.source.as_str(), pair.kind, &pair.tolerance, &pair.selected].map(str::to_owned);
+        let [x, y] = self.window.at.map(|w| w.to_string());
+        let head = [self.window.source.as_str(), &x, &y, pair.kind, &pair.tolerance, &pair.selected]
+            .map(str::to_owned);
         let counts = counts.map(|count| count.to_string()).into_iter().chain([format!("{left:.1}")]);
         let differences = pairs.map(|(a, b)| Self::difference(a, b));
         let cells = differences.iter().flatten().map(|pixels| format!("{pixels:.2}"));
@@ -125,12 +126,15 @@ impl<'a> Sight<'a> {
         let full = view::render(field, field.heights(), looker);
         let mut pictures = vec![Picture {
             file: format!("{number}-view-full.png"),
-            caption: "The full grid from the zone, towards the highest ground".to_owned(),
+            caption: format!(
+                "{}: the full grid from the zone, towards the highest ground",
+                self.window.label()
+            ),
             bytes: drawn(view::png(&full))?,
         }];
         for (pair, moved) in pairs {
             let name = pair.kind.split(' ').next().unwrap_or_default();
-            let about = format!("{} within {}", pair.kind, pair.tolerance);
+            let about = format!("{}: {} within {}", self.window.label(), pair.kind, pair.tolerance);
             let views = pair.surfaces.each_ref().map(|heights| view::render(field, heights, looker));
             for ((which, seen), mesh) in
                 [("plain", &views[0]), ("masked", &views[1])].iter().zip(&pair.meshes)
@@ -170,7 +174,7 @@ impl<'a> Sight<'a> {
             });
             let azimuth = "azimuth [degrees from east]";
             let axes = [azimuth, "elevation [degrees]"];
-            let title = format!("{}, {}: skyline from the zone", self.window.source, pair.kind);
+            let title = format!("{}, {}: skyline from the zone", self.window.label(), pair.kind);
             pictures.push(Picture {
                 file: format!("{number}-{name}-skyline.svg"),
                 caption: format!("{about}: skylines of the full grid and of both meshes"),
@@ -179,7 +183,7 @@ impl<'a> Sight<'a> {
             let axes = [azimuth, "largest difference of all places [pixels]"];
             let points = thinned(&Self::apart(masked, plain));
             let series = [plot::Series { name: "moved by the mask".to_owned(), points }];
-            let title = format!("{}, {}: how far the mask moves skylines", self.window.source, pair.kind);
+            let title = format!("{}, {}: how far the mask moves skylines", self.window.label(), pair.kind);
             pictures.push(Picture {
                 file: format!("{number}-{name}-moved.svg"),
                 caption: format!("{about}: the mask moves skylines by {moved:.2} pixels at most"),

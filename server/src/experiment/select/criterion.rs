@@ -103,10 +103,15 @@ impl Criterion {
         self == Self::Curvature
     }
 
-    /// How far a sample counts as off the surface, if errors are distances: upright, which is never less than
-    /// at right angles to whatever triangle will be there in the end.
-    pub(super) fn distance(self, ground: &Ground<'_>, slot: usize, off: f64) -> Option<f64> {
-        matches!(self, Self::Vertical | Self::Euclidean).then(|| ground.weight(slot) * off.abs())
+    /// Whether errors are distances. Upright they are never less than at right angles to whatever triangle will be
+    /// there in the end.
+    pub(super) fn is_distance(self) -> bool {
+        matches!(self, Self::Vertical | Self::Euclidean)
+    }
+
+    /// Whether a sample that is off the surface by so much makes its triangle worse than a tolerance by itself.
+    pub(super) fn is_beyond(self, ground: &Ground<'_>, slot: usize, off: f64, tolerance: f64) -> bool {
+        self == Self::Vertical && ground.weight(slot) * off.abs() > tolerance
     }
 
     /// The points whose coefficients are more than the tolerance; by another criterion, the corners alone.

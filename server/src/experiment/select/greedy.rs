@@ -6,6 +6,7 @@
 //! overtaken are recognised by their error, which is no longer the one last known.
 
 use super::{Criterion, Ground};
+use crate::experiment::field::Field;
 use diamantina_protocol::bintree::Point;
 use diamantina_protocol::bitree::{Bitree, Facet};
 use std::collections::BinaryHeap;
@@ -79,9 +80,9 @@ pub fn greedy(
             queue.push_drawn(&tree, &facet);
             continue;
         }
-        let (point, off) = farthest(ground, criterion, &facet);
+        let (point, off) = farthest(field, &facet);
         let is_level = off == 0.0 && criterion.splits_level() && !field.at(point).is_nan();
-        if is_level || off > share * error || (off > 0.0 && criterion.distance(ground, 0, 1.0).is_none()) {
+        if is_level || off > share * error || (off > 0.0 && !criterion.is_distance()) {
             tree.add(point, field.at(point));
             points += 1;
             for half in tree.around(point).into_iter().flatten().flat_map(|t| tree.halves(&t)) {
@@ -97,18 +98,17 @@ pub fn greedy(
 }
 
 /// Of the middle and the corners of a triangle, the point whose sample is farthest off the surface; the middle if none is.
-fn farthest(ground: &Ground<'_>, criterion: Criterion, facet: &Facet) -> (Point, f64) {
-    let field = ground.field();
+/// Whatever its weight: others' triangles, which may count, hang on it.
+fn farthest(field: &Field, facet: &Facet) -> (Point, f64) {
     let [ha, _, hb] = facet.heights();
     let is_finest = facet.level() >= 2 * u32::from(field.log2());
     let middle = (facet.middle(), (ha + hb) / 2.0);
     let corners = facet.corners().into_iter().zip(facet.heights());
     let mut best = (facet.middle(), 0.0);
     for (point, height) in corners.chain((!is_finest).then_some(middle)) {
-        let off = field.at(point) - height;
-        let distance = criterion.distance(ground, field.slot(point), off).unwrap_or(off.abs());
-        if distance > best.1 {
-            best = (point, distance);
+        let off = (field.at(point) - height).abs();
+        if off > best.1 {
+            best = (point, off);
         }
     }
     best

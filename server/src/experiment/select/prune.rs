@@ -60,8 +60,7 @@ fn has_to_stay(
     let Some(facet) = tree.around(point).into_iter().flatten().next() else { return false };
     let [ha, _, hb] = facet.heights();
     let off = ground.field().at(point) - (ha + hb) / 2.0;
-    criterion == Criterion::Vertical
-        && criterion.distance(ground, ground.field().slot(point), off) > Some(tolerance)
+    criterion.is_beyond(ground, ground.field().slot(point), off, tolerance)
 }
 
 /// Every real point; the corners, which always stay, do no harm.

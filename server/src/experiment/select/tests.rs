@@ -174,6 +174,28 @@ fn each_criterion_sees_its_own_fault() {
 }
 
 #[test]
+fn a_mask_costs_no_triangles_even_where_it_counts_nothing() {
+    let heights = |s: usize| {
+        let (x, y) = ((s % SIDE) as f64, (s / SIDE) as f64);
+        100.0 * (x / 5.0).sin() * (y / 7.0).cos() + 9.0 * (x * 1.7).sin() + 7.0 * (y * 2.1).cos()
+    };
+    let field = Field::new(5, (0..SIDE * SIDE).map(heights).collect(), [30.0, 30.0]).unwrap();
+    for hidden in [0.0, 0.001, 0.05] {
+        // A quarter is seen, in strips.
+        let mask: Vec<f32> =
+            (0..SIDE * SIDE).map(|s| if s % SIDE / 4 % 4 == 0 { 1.0 } else { hidden }).collect();
+        let [plain, masked] = [None, Some(&mask[..])].map(|w| Ground::new(&field, w).unwrap());
+        for percent in [0.5, 1.0, 2.0, 5.0, 10.0] {
+            let tolerance = percent / 100.0 * field.relief();
+            let [plain, masked] =
+                [&plain, &masked].map(|g| by_strategy(g, Criterion::Vertical, tolerance, Strategy::Compact));
+            let counts = [&masked, &plain].map(|tree| tree.triangle_count());
+            assert!(counts[0] < counts[1], "{hidden}, {percent} %: {counts:?}");
+        }
+    }
+}
+
+#[test]
 fn coefficients_are_weighed_and_the_largest_come_first() {
     let mut heights = vec![0.0; SIDE * SIDE];
     for (slot, height) in [(16 * SIDE + 9, 50.0), (5 * SIDE + 21, 30.0), (27 * SIDE + 3, 10.0)] {

@@ -54,8 +54,7 @@ pub(super) fn descend(
         now.retain(|facet| {
             // The middle is one of the samples, and often tells enough.
             let middle = ground.field().slot(facet.middle());
-            criterion == Criterion::Vertical
-                && criterion.distance(ground, middle, off(ground, facet)) > Some(tolerance)
+            criterion.is_beyond(ground, middle, off(ground, facet), tolerance)
                 || criterion.error(ground, facet, tolerance) > tolerance
         });
         for facet in &now {
@@ -65,13 +64,14 @@ pub(super) fn descend(
         for facet in &now {
             let m = facet.middle();
             let off = off(ground, facet);
-            let distance = criterion.distance(ground, field.slot(m), off);
-            let is_off = match distance {
-                Some(distance) => distance > share * tolerance,
-                None => off != 0.0 || criterion.splits_level(),
+            // Whatever the middle's own weight: triangles that count hang on it.
+            let is_off = if criterion.is_distance() {
+                off.abs() > share * tolerance
+            } else {
+                off != 0.0 || criterion.splits_level()
             };
             if is_off && !off.is_nan() && draft.add(m, field.at(m)).is_none() {
-                if criterion != Criterion::Vertical || distance <= Some(tolerance) {
+                if !criterion.is_beyond(ground, field.slot(m), off, tolerance) {
                     may_go.push(m);
                 }
                 let is_outermost = m.iter().any(|w| *w == 0 || *w == 1 << field.log2());
