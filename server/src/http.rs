@@ -213,7 +213,7 @@ impl Server {
     }
 }
 
-/// Opens all that a server would open, but for its port, and says which scenes it would serve.
+/// Opens all that a server would open, but for its port and its disk cache, and says which scenes it would serve.
 ///
 /// # Errors
 /// As [`Server::open_with`].
@@ -222,11 +222,8 @@ pub fn check(stores: &[PathBuf], options: &Options) -> Result<Vec<String>, Serve
     if let Some((certificate, key)) = &options.certificate {
         Tls::open(certificate, key)?;
     }
-    Ok(Scenes::open(stores, &options.shared()?)?
-        .all()
-        .iter()
-        .map(|store| store.scene().name.clone())
-        .collect())
+    // The disk cache may be in use by the server that these settings are for.
+    Ok(Scenes::open(stores, &Arc::default())?.all().iter().map(|store| store.scene().name.clone()).collect())
 }
 
 /// Looks for what changes beside the server, as long as it runs: versions of scenes, tokens, certificates.

@@ -159,7 +159,7 @@ struct ServeArgs {
 
 #[derive(Subcommand)]
 enum ConfigCommand {
-    /// Try all that `serve` would do with a file of settings, but for listening
+    /// Try all that `serve` would do with a file of settings, but for listening and the disk cache
     Check(Box<ServeArgs>),
     /// Print all settings as a file, and where each is from
     Print(Box<ServeArgs>),

@@ -101,7 +101,12 @@ impl Disk {
                 None => return Err(refused(format!("expected a folder of its own, found '{name}' in it"))),
             }
         }
-        let lock = super::lock(root)?;
+        let lock = super::lock(root).map_err(|error| match error {
+            StoreError::Busy(_) => {
+                refused("another server uses it: give each a folder of its own".to_owned())
+            }
+            other => other,
+        })?;
         let mut options = OptionsBuilder::new();
         // The number of items is a hint for the first allocation alone.
         options.weight_capacity(budget).estimated_items_capacity(1024).shards(SHARDS);
@@ -195,7 +200,8 @@ mod tests {
                 assert!(disk.get((1, 0, 0), 250_000).is_some(), "what is asked for stays");
             }
             assert!(on_disk(&root) <= 16 << 20 && on_disk(&root) > 8 << 20, "{}", on_disk(&root));
-            assert!(Disk::open(&root, 16 << 20).is_err(), "another server is at it");
+            let told = Disk::open(&root, 16 << 20).unwrap_err().to_string();
+            assert!(told.contains("another server"), "{told}");
         }
         // A kill in the middle of a write.
         fs::write(root.join("0000000000000001/new7"), "x").unwrap();
