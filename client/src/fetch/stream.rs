@@ -8,6 +8,7 @@
 use super::batch::Frames;
 use super::http::{PAGE_BYTES_MAX, shortened};
 use super::tasks::Shared;
+use super::unpack::unpack;
 use super::{Event, FetchError, Key};
 use bytes::Bytes;
 use diamantina_protocol::bintree::Forest;
@@ -43,8 +44,7 @@ impl Ledger {
                     return Err(FetchError::Unasked(centre));
                 }
                 // Stops at the limit, whatever the bytes claim to become.
-                let page = zstd::bulk::decompress(blob, PAGE_BYTES_MAX)
-                    .map_err(|_| FetchError::Compression(number))?;
+                let page = unpack(blob, PAGE_BYTES_MAX).ok_or(FetchError::Compression(number))?;
                 Ok(Entered::Page(number, index::decode(&self.forest, number, &page)?))
             }
             Status::Ok => {
@@ -70,11 +70,11 @@ impl Shared {
     pub(super) async fn stream(&self, layer: usize, ask: &StreamAsk) -> Result<(), FetchError> {
         let layer_of = &self.scene.layers[layer];
         let route = message::stream_route(&self.scene.name, &self.scene.version, &layer_of.name, ask);
-        let mut response = self.http.get(&route).await?;
+        let mut chunks = self.http.get(&route).await?;
         let mut frames = Frames::default();
         let (diamonds, pages) = (HashSet::default(), HashSet::default());
         let mut ledger = Ledger { forest: layer_of.forest, diamonds, pages };
-        while let Some(chunk) = self.http.chunk(&mut response).await? {
+        while let Some(chunk) = self.http.chunk(&mut chunks).await? {
             frames.push(&chunk);
             while let Some((header, blob)) = frames.take()? {
                 match ledger.enter(&header, &blob)? {

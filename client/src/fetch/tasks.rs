@@ -3,7 +3,9 @@
 use super::batch::{Batch, Frames};
 use super::http::{Http, PAGE_BYTES_MAX, count, pause, shortened};
 use super::stream::weight;
+use super::unpack::unpack;
 use super::{Event, FetchError, Key, REST, TRIES_MAX, Want};
+use crate::background::within;
 use crate::encoding::Encoding;
 use bytes::Bytes;
 use diamantina_protocol::bintree::Forest;
@@ -14,8 +16,8 @@ use foldhash::fast::RandomState;
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
-use std::time::Instant;
 use tokio::sync::Notify;
+use web_time::Instant;
 
 #[derive(Debug)]
 pub(super) struct Shared {
@@ -106,7 +108,7 @@ pub(super) async fn work(shared: Arc<Shared>) {
         match shared.next() {
             Next::Wait(None) => changed.await,
             Next::Wait(Some(until)) => {
-                let _ = tokio::time::timeout_at(until.into(), changed).await;
+                let _ = within(until.saturating_duration_since(Instant::now()), changed).await;
             }
             Next::Fetch { id, cancel, request } => {
                 let done = tokio::select! {
@@ -216,8 +218,7 @@ impl Shared {
                 let route = self.encoding.index_route(&self.scene, *layer, *number);
                 let body = self.http.whole(&route, PAGE_BYTES_MAX).await?;
                 // Stops at the limit, whatever the bytes claim to become.
-                let page = zstd::bulk::decompress(&body, PAGE_BYTES_MAX)
-                    .map_err(|_| FetchError::Compression(*number))?;
+                let page = unpack(&body, PAGE_BYTES_MAX).ok_or(FetchError::Compression(*number))?;
                 let entries = index::decode(&layer_of.forest, *number, &page)?;
                 self.deliver(Key::Page(*layer, *number), Event::Page(*layer, *number, entries));
                 Ok(())
@@ -225,12 +226,12 @@ impl Shared {
             Request::Batch(layer, wants) => {
                 let centres: Vec<_> = wants.iter().map(|(d, _)| d.centre()).collect();
                 let route = self.encoding.batch_route(&self.scene, *layer, &centres);
-                let mut response = self.http.get(&route).await?;
+                let mut chunks = self.http.get(&route).await?;
                 let mut owed: HashMap<[u32; 2], (Diamond, Option<u32>)> =
                     wants.iter().map(|want| (want.0.centre(), *want)).collect();
                 let mut frames = Frames::default();
                 let mut bad = None;
-                while let Some(chunk) = self.http.chunk(&mut response).await? {
+                while let Some(chunk) = self.http.chunk(&mut chunks).await? {
                     frames.push(&chunk);
                     while let Some((header, payload)) = frames.take()? {
                         let centre = header.centre;
