@@ -2,7 +2,7 @@
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .NOTPARALLEL:
-.PHONY: help demo test test-long check contract bench bench-link bench-peers bench-serve bench-wasm setup fmt clippy tests doc deny wasm scripts
+.PHONY: help demo test test-long check contract bench bench-link bench-peers bench-serve bench-wasm setup fmt clippy tests doc deny wasm web web-test scripts
 
 # Mesa's device selection complains where there is no desktop session; there is nothing to select.
 export NODEVICE_SELECT := 1
@@ -12,6 +12,7 @@ target := $(or $(CARGO_TARGET_DIR),target)
 
 help:
 	@echo "make demo    a sample scene built, served and drawn (HEADLESS=1: end after the picture)"
+	@echo "make web     the viewer for browsers, into target/web, where the server finds it"
 	@echo "make test    everything that CI runs"
 	@echo "make check   formatting and lints only"
 	@echo "make bench   benchmarks, with a table at the end"
@@ -26,7 +27,7 @@ demo:
 	@$(step) build cargo build --locked --release -p diamantina-server -p diamantina-client
 	$(target)/release/diamantina-server demo
 
-test: setup fmt clippy tests contract doc deny wasm scripts
+test: setup fmt clippy tests contract doc deny wasm web-test scripts
 
 check: fmt clippy
 
@@ -82,5 +83,12 @@ deny:
 wasm:
 	@$(step) wasm scripts/wasm
 
+web:
+	@$(step) web scripts/web
+
+# After the tests, as the contract.
+web-test:
+	@$(step) web-test scripts/web-test
+
 scripts:
-	@$(step) scripts shellcheck .ci/run scripts/bench scripts/bench-link scripts/bench-peers scripts/bench-serve scripts/bench-wasm scripts/contract scripts/deny scripts/setup scripts/step scripts/wasm scripts/wasm-cargo
+	@$(step) scripts shellcheck .ci/run scripts/bench scripts/bench-link scripts/bench-peers scripts/bench-serve scripts/bench-wasm scripts/contract scripts/deny scripts/setup scripts/step scripts/wasm scripts/wasm-cargo scripts/web scripts/web-test
