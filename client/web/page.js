@@ -14,13 +14,13 @@ document.getElementById('terrain').addEventListener('webglcontextlost', () => {
     fail('The graphics device was lost. Load the page again.');
 });
 
-// For scripts: window.diamantina.state() tells what the viewer shows.
-window.diamantina = { state: () => JSON.parse(state()) };
-
 if (typeof WebAssembly !== 'object') {
     fail('The viewer needs WebAssembly, which this browser has not, or has switched off.');
 } else {
-    start().catch((error) => {
+    start().then(() => {
+        // For scripts: window.diamantina.state() tells what the viewer shows.
+        window.diamantina = { state: () => JSON.parse(state()) };
+    }).catch((error) => {
         console.error(error);
         fail(`The viewer cannot be loaded (${error}). Load the page again.`);
     });
