@@ -2,7 +2,7 @@
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .NOTPARALLEL:
-.PHONY: help demo test test-long check contract objects bench bench-link bench-peers bench-serve bench-wasm setup fmt clippy tests doc deny wasm scripts
+.PHONY: help demo test test-long check contract objects bench bench-link bench-peers bench-serve bench-wasm setup fmt clippy tests doc deny wasm web web-test scripts
 
 # Mesa's device selection complains where there is no desktop session; there is nothing to select.
 export NODEVICE_SELECT := 1
@@ -12,7 +12,9 @@ target := $(or $(CARGO_TARGET_DIR),target)
 
 help:
 	@echo "make demo    a sample scene built, served and drawn (HEADLESS=1: end after the picture)"
+	@echo "make web     the viewer for browsers, into target/web, where the server finds it"
 	@echo "make test    everything that CI runs"
+	@echo "make web-test  the viewer in a headless Chromium, on WebGPU and on WebGL2"
 	@echo "make check   formatting and lints only"
 	@echo "make bench   benchmarks, with a table at the end"
 	@echo "make bench-link    seconds to a view over slow links, on the DEMs of DIAMANTINA_DATA"
@@ -86,5 +88,15 @@ deny:
 wasm:
 	@$(step) wasm scripts/wasm
 
+web:
+	@$(step) setup scripts/setup web
+	@$(step) web scripts/web
+
+# Ten minutes where nothing of it is built yet.
+web-test:
+	@$(step) setup scripts/setup test
+	@$(step) setup scripts/setup web
+	@$(step) web-test scripts/web-test
+
 scripts:
-	@$(step) scripts shellcheck .ci/run scripts/bench scripts/bench-link scripts/bench-peers scripts/bench-serve scripts/bench-wasm scripts/contract scripts/deny scripts/objects scripts/setup scripts/step scripts/wasm scripts/wasm-cargo
+	@$(step) scripts shellcheck .ci/run scripts/bench scripts/bench-link scripts/bench-peers scripts/bench-serve scripts/bench-wasm scripts/contract scripts/deny scripts/objects scripts/setup scripts/step scripts/wasm scripts/wasm-cargo scripts/web scripts/web-test

@@ -123,7 +123,7 @@ fn every_sample_of_a_small_dem_has_its_height_over_http() {
     let served = serve(&[store]);
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
     runtime.block_on(async {
-        let client = reqwest::Client::builder().no_proxy().build().unwrap();
+        let client = crate::world::asker().build().unwrap();
         for (x, y) in (0..size[1]).flat_map(|y| (0..size[0]).map(move |x| (x, y))) {
             let [fx, fy] = layer.position([x, y]);
             let url = format!("{}/terrain/height?x={fx}&y={fy}", served.scene("world"));

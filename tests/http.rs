@@ -36,7 +36,7 @@ impl Answer {
 }
 
 async fn ask(method: Method, url: &str, headers: &[(HeaderName, &str)]) -> Answer {
-    let client = reqwest::Client::builder().no_proxy().build().unwrap();
+    let client = crate::world::asker().build().unwrap();
     let mut request = client.request(method, url);
     for (name, value) in headers {
         request = request.header(name, *value);

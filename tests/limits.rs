@@ -186,7 +186,7 @@ fn http_2_without_encryption_is_spoken() {
     let world = World::sample(129, 0.0);
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     runtime.block_on(async {
-        let client = reqwest::Client::builder().no_proxy().http2_prior_knowledge().build().unwrap();
+        let client = crate::world::asker().http2_prior_knowledge().build().unwrap();
         let url = format!("{}{}", world.served.address, batch(&world));
         let answers: Vec<_> = (0..8).map(|_| tokio::spawn(client.get(&url).send())).collect();
         for answer in answers {

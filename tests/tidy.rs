@@ -49,6 +49,7 @@ const SERVER: &[(&str, &[&str])] = &[
 
 /// `cut` is a pure function of what it is given; the GPU is `render`'s and the fronts'.
 const CLIENT: &[(&str, &[&str])] = &[
+    ("background", &[]),
     ("camera", &[]),
     ("encoding", &[]),
     ("surface", &["encoding"]),
@@ -56,17 +57,37 @@ const CLIENT: &[(&str, &[&str])] = &[
     ("morph", &["surface"]),
     ("drawing", &["morph", "surface"]),
     ("cache", &["surface"]),
-    ("fetch", &["encoding"]),
+    ("fetch", &["background", "encoding"]),
     ("doctor", &["encoding", "fetch", "surface"]),
     ("sight", &["camera"]),
     ("cut", &["camera", "drawing", "encoding", "morph", "sight", "surface"]),
-    ("terrain", &["cache", "camera", "cut", "drawing", "encoding", "fetch", "morph", "sight", "surface"]),
+    (
+        "terrain",
+        &[
+            "background",
+            "cache",
+            "camera",
+            "cut",
+            "drawing",
+            "encoding",
+            "fetch",
+            "morph",
+            "sight",
+            "surface",
+        ],
+    ),
     ("render", &["camera", "drawing", "morph", "picture", "surface"]),
     ("controls", &["camera"]),
     ("pick", &["drawing", "surface"]),
-    ("headless", &["camera", "fetch", "picture", "render", "surface", "terrain"]),
-    ("viewer", &["camera", "controls", "drawing", "headless", "pick", "picture", "render", "terrain"]),
-    ("web", &["viewer"]),
+    ("overview", &["camera"]),
+    ("headless", &["camera", "fetch", "overview", "picture", "render", "surface", "terrain"]),
+    (
+        "viewer",
+        &["camera", "controls", "drawing", "headless", "overview", "pick", "picture", "render", "terrain"],
+    ),
+    ("web", &["encoding", "fetch", "render", "terrain", "viewer"]),
+    // The command line.
+    ("command", &[]),
     // The made scene of the crate's own tests.
     ("world", &["camera", "drawing", "encoding", "surface"]),
 ];

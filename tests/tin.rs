@@ -389,7 +389,7 @@ fn triangles_are_served_and_what_is_not_built_is_refused() {
     }
     let served = serve(&stores);
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    let client = reqwest::Client::builder().no_proxy().build().unwrap();
+    let client = crate::world::asker().build().unwrap();
     let get = |route: &str| {
         runtime.block_on(async {
             let answer = client.get(format!("{}{route}", served.address)).send().await.unwrap();

@@ -131,6 +131,13 @@ pub(crate) fn build(
     hierarchy::build(&source, store, options, &Progress::new()).unwrap()
 }
 
+/// A client over HTTP that asks servers of this machine directly, to be told more.
+pub(crate) fn asker() -> reqwest::ClientBuilder {
+    // The first one stays; the client under test may have chosen it.
+    let _ = tokio_rustls::rustls::crypto::ring::default_provider().install_default();
+    reqwest::Client::builder().no_proxy()
+}
+
 /// A server of some stores, on a free port, until dropped.
 pub(crate) struct Served {
     /// `http://127.0.0.1:PORT`.

@@ -224,7 +224,13 @@ fn served_zone(lake: &Lake, scene: &Scene) {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     let get = |route: &str| {
         runtime.block_on(async {
-            let answer = reqwest::get(format!("{}{route}", served.address)).await.unwrap();
+            let answer = crate::world::asker()
+                .build()
+                .unwrap()
+                .get(format!("{}{route}", served.address))
+                .send()
+                .await
+                .unwrap();
             (answer.status().as_u16(), answer.headers().clone(), answer.bytes().await.unwrap())
         })
     };

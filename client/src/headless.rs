@@ -1,6 +1,7 @@
 //! Pictures and flights without a window.
 
 use crate::camera::{Camera, FOV_Y};
+use crate::overview::{around, stretched};
 use crate::picture::{Picture, write_png};
 use crate::render::{self, FrameStats, Look, Offscreen, RenderError};
 use crate::surface::Surface;
@@ -20,6 +21,8 @@ const KEYS_MAX: usize = 100_000;
 
 /// The largest file with a path, in bytes.
 const PATH_BYTES_MAX: u64 = 64 << 20;
+
+pub use crate::overview::{extent, overview, stretched_overview};
 
 /// Why there is no picture or flight.
 #[derive(Debug, thiserror::Error)]
@@ -60,49 +63,14 @@ fn file_error<'a>(action: &'static str, path: &'a Path) -> impl Fn(std::io::Erro
     move |error| HeadlessError::File { action, path: path.to_owned(), error }
 }
 
-/// The box around a scene, in frame coordinates and metres: south-west-lowest and north-east-highest.
-#[must_use]
-pub fn extent(scene: &Scene) -> [DVec3; 2] {
-    let boxes = scene.layers.iter().map(|l| {
-        let [x0, y0] = l.origin;
-        let [x1, y1] = l.position(l.samples.map(|s| s - 1));
-        [DVec3::new(x0, y0, l.heights[0]), DVec3::new(x1, y1, l.heights[1])]
-    });
-    boxes.reduce(|[a, b], [c, d]| [a.min(c), b.max(d)]).unwrap_or([DVec3::ZERO, DVec3::ONE])
-}
-
-/// Degrees below the horizon that an overview may look down: as flat as mountains look best, and as steep
-/// as maps.
-const TILTS: [u32; 2] = [30, 54];
-
-/// The part of the picture's width or height that an overview fills.
-const FILLED: f64 = 0.95;
-
 /// The error, in pixels, at which what is drawn tells the outline of a scene.
 const OUTLINE_PIXELS: f64 = 12.0;
-
-/// A camera that sees a whole scene, from the south and above, as near as the box around it allows.
-#[must_use]
-pub fn overview(scene: &Scene, size: [u32; 2]) -> Camera {
-    around_box(extent(scene), size, 1.0)
-}
-
-fn around_box([low, high]: [DVec3; 2], size: [u32; 2], exaggeration: f64) -> Camera {
-    let corner = |i: u32| DVec3::select(glam::BVec3::new(i & 1 > 0, i & 2 > 0, i & 4 > 0), high, low);
-    around(&(0..8).map(corner).collect::<Vec<_>>(), size, exaggeration)
-}
 
 /// Begins to stream what a picture from `camera` needs, in one request; [`picture`] (or [`framed`]) goes on from
 /// there. The camera's heights are stretched as there.
 pub fn stream(terrain: &mut Terrain, camera: &Camera, exaggeration: f64) {
     terrain.set_exaggeration(exaggeration);
     terrain.stream(&stretched(camera, exaggeration));
-}
-
-/// As [`overview`], of a scene whose heights are multiplied by `exaggeration` (but the camera's are not).
-#[must_use]
-pub fn stretched_overview(scene: &Scene, size: [u32; 2], exaggeration: f64) -> Camera {
-    around_box(extent(scene), size, exaggeration)
 }
 
 /// As [`overview`], but as near as the terrain itself allows, which may be less than its box: waits for a
@@ -147,69 +115,6 @@ fn points_of(layer: &Layer, diamond: Diamond, block: &Block) -> impl Iterator<It
         };
         (height != NODATA).then(|| DVec3::new(along(0), along(1), layer.metres(height)))
     })
-}
-
-/// The camera from the south and above that holds all points as large as can be. Of the tilts, it takes the
-/// one at which they fill the picture best.
-fn around(points: &[DVec3], size: [u32; 2], exaggeration: f64) -> Camera {
-    let points: Vec<DVec3> = points.iter().map(|p| p.with_z(p.z * exaggeration)).collect();
-    let low = points.iter().copied().fold(DVec3::INFINITY, DVec3::min);
-    let high = points.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max);
-    let filled = |camera: &Camera| {
-        // The ground's trapezium, in parts of the picture.
-        let [right, up, backward] = camera.axes();
-        let corners = [[low.x, low.y], [high.x, low.y], [high.x, high.y], [low.x, high.y]].map(|[x, y]| {
-            let p = DVec3::new(x, y, f64::midpoint(low.z, high.z)) - camera.eye;
-            glam::DVec2::new(p.dot(right), p.dot(up)) / p.dot(-backward)
-        });
-        (corners[2] - corners[0]).perp_dot(corners[3] - corners[1])
-    };
-    let cameras = (TILTS[0]..=TILTS[1]).step_by(3).map(|tilt| fit(&points, tilt, size));
-    let best = cameras.max_by(|a, b| filled(a).total_cmp(&filled(b)));
-    let best = best.unwrap_or_else(|| fit(&points, TILTS[0], size));
-    let flat = |p: DVec3| p.with_z(p.z / exaggeration);
-    Camera { eye: flat(best.eye), target: flat(best.target), ..best }
-}
-
-/// The camera that looks down by `tilt` degrees and holds all points as large as can be.
-fn fit(points: &[DVec3], tilt: u32, size: [u32; 2]) -> Camera {
-    let tilt = f64::from(tilt).to_radians();
-    let backward = DVec3::new(0.0, -tilt.cos(), tilt.sin());
-    let axes = Camera { eye: backward, target: DVec3::ZERO, fov_y: FOV_Y, size }.axes();
-    let tan_y = (FOV_Y / 2.0).tan();
-    let tan_x = tan_y * f64::from(size[0].max(1)) / f64::from(size[1].max(1));
-    // Relative to one of the points, for precision.
-    let base = points.first().copied().unwrap_or_default();
-    // Of an eye at (x, y, back) along the axes, the point at (px, py, pback) is seen if
-    // |px - x| <= tan_x (back - pback), and so for y: four linear bounds.
-    let side = |axis: DVec3, tan: f64| {
-        let bound = |p: &DVec3| (*p - base).dot(axis) + tan * (*p - base).dot(axes[2]);
-        points.iter().map(bound).fold(f64::NEG_INFINITY, f64::max)
-    };
-    let (tan_x, tan_y) = (tan_x * FILLED, tan_y * FILLED);
-    let [east, west] = [axes[0], -axes[0]].map(|axis| side(axis, tan_x));
-    let [top, bottom] = [axes[1], -axes[1]].map(|axis| side(axis, tan_y));
-    let back = ((east + west) / (2.0 * tan_x)).max((top + bottom) / (2.0 * tan_y));
-    let [x, y] = [(east - west) / 2.0, (top - bottom) / 2.0];
-    let eye = base + axes[0] * x + axes[1] * y + axes[2] * back;
-    // Half way into the scene.
-    let depth = |p: &DVec3| (eye - *p).dot(axes[2]);
-    let nearest = points.iter().map(depth).fold(f64::INFINITY, f64::min);
-    let farthest = points.iter().map(depth).fold(0.0, f64::max);
-    // A single point has no size to look at.
-    let ahead = f64::midpoint(nearest, farthest).max(1e-3);
-    Camera {
-        eye: eye + backward * if back > 0.0 { 0.0 } else { 1.0 },
-        target: eye - backward * ahead,
-        fov_y: FOV_Y,
-        size,
-    }
-}
-
-/// The camera of a picture whose heights are multiplied: its own heights are, too.
-fn stretched(camera: &Camera, exaggeration: f64) -> Camera {
-    let stretch = |p: DVec3| p.with_z(p.z * exaggeration);
-    Camera { eye: stretch(camera.eye), target: stretch(camera.target), ..*camera }
 }
 
 /// Numbers about a picture.
@@ -646,19 +551,6 @@ mod tests {
         PathKey { seconds, eye: [x, 0.0, 100.0], target: [x, 500.0, 0.0] }
     }
 
-    /// Clip coordinates of a point, with 1 at the picture's sides.
-    fn seen(camera: &Camera, p: DVec3) -> [f64; 3] {
-        let [right, up, backward] = camera.axes();
-        let (tan, from) = ((camera.fov_y / 2.0).tan(), p - camera.eye);
-        let depth = -from.dot(backward);
-        let aspect = f64::from(camera.size[0]) / f64::from(camera.size[1]);
-        [from.dot(right) / depth / tan / aspect, from.dot(up) / depth / tan, depth]
-    }
-
-    fn corners([low, high]: [DVec3; 2]) -> [DVec3; 8] {
-        std::array::from_fn(|i| DVec3::select(glam::BVec3::new(i & 1 > 0, i & 2 > 0, i & 4 > 0), high, low))
-    }
-
     #[test]
     fn a_picture_is_written_whole_or_not_at_all() {
         let folder = tempfile::tempdir().unwrap();
@@ -672,34 +564,6 @@ mod tests {
         assert_eq!(std::fs::read(&path).unwrap(), before, "the old one stays");
         let full = save(&picture, Path::new("/dev/full")).unwrap_err().to_string();
         assert!(full.contains("/dev/full") && full.contains("write the picture"), "{full}");
-    }
-
-    #[test]
-    fn an_overview_holds_the_box_tightly() {
-        let boxes = [
-            [DVec3::new(5e5, 4e6, 0.0), DVec3::new(5.6e5, 4.06e6, 3500.0)],
-            [DVec3::new(0.0, 0.0, -0.135), DVec3::new(5.5, 3.4, 0.125)],
-            [DVec3::new(-1e6, 2e6, -4800.0), DVec3::new(-3e4, 2.97e6, 5900.0)],
-            [DVec3::new(4e5, 4e6, 100.0), DVec3::new(4.1e5, 4.09e6, 900.0)],
-            [DVec3::new(4e5, 4e6, 100.0), DVec3::new(4.9e5, 4.01e6, 900.0)],
-        ];
-        for size in [[1380, 768], [400, 900]] {
-            for bounds in boxes {
-                let camera = around_box(bounds, size, 1.0);
-                let seen = corners(bounds).map(|p| seen(&camera, p));
-                assert!(seen.iter().all(|s| s[2] > 0.0), "{camera:?}");
-                let most = |i: usize| seen.iter().map(|s| s[i].abs()).fold(0.0, f64::max);
-                let widest = most(0).max(most(1));
-                assert!((widest - FILLED).abs() < 1e-6, "{widest} {camera:?}");
-                assert!(camera.eye.y < bounds[0].y && camera.eye.z > bounds[1].z, "from the south and above");
-            }
-        }
-    }
-
-    #[test]
-    fn a_lone_point_has_an_overview() {
-        let camera = around(&[DVec3::new(5e5, 4e6, 100.0)], [4, 3], 1.0);
-        assert!(camera.eye.is_finite() && camera.eye != camera.target, "{camera:?}");
     }
 
     #[test]

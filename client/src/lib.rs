@@ -5,6 +5,7 @@
 //! | [`camera`] | the eye; how large a metre looks |
 //! | [`sight`] | how large an error looks: metres and a box → pixels |
 //! | [`cut`] | camera and resident diamonds → what to draw and what to ask for |
+//! | [`background`] | work beside the frames: on threads, or between frames in a browser |
 //! | [`fetch`] | requests by priority, retried, cancellable; answers as they stream in |
 //! | [`cache`] | decoded diamonds under a byte budget |
 //! | [`encoding`] | points or irregular triangles: which of them is streamed |
@@ -16,20 +17,26 @@
 //! | [`drawing`] | what a frame draws, as plain data |
 //! | [`render`] | drawing + camera → pixels; the only module that knows the GPU |
 //! | [`picture`] | pixels → PNG |
+//! | [`overview`] | where a whole scene is seen from |
 //! | [`headless`] | pictures and flights without a window |
 //! | [`doctor`] | what is wrong with a server as clients see it |
 //! | [`viewer`] | the terrain with a panel and a mouse; in a window |
+//! | `web` | the same on a page, in a browser |
 
+pub mod background;
 pub mod cache;
 pub mod camera;
 pub mod controls;
 pub mod cut;
+#[cfg(not(target_arch = "wasm32"))]
 pub mod doctor;
 pub mod drawing;
 pub mod encoding;
 pub mod fetch;
+#[cfg(not(target_arch = "wasm32"))]
 pub mod headless;
 pub mod morph;
+pub mod overview;
 pub mod pick;
 pub mod picture;
 pub mod render;
@@ -37,6 +44,8 @@ pub mod sight;
 pub mod surface;
 pub mod terrain;
 pub mod viewer;
+#[cfg(target_arch = "wasm32")]
+pub mod web;
 
 #[cfg(test)]
 #[allow(

@@ -36,7 +36,9 @@ use glam::DVec3;
 use reload::Reload;
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+#[cfg(not(target_arch = "wasm32"))]
+use std::time::Duration;
+use web_time::Instant;
 
 /// Bytes of payloads that are wished for or wait for their parents. Some 20 000 typical payloads.
 const HELD_BYTES_MAX: usize = 16 << 20;
@@ -244,14 +246,14 @@ struct ZoneView {
 }
 
 impl ZoneView {
-    /// Fetches the masks of a zone, waiting for them.
-    fn fetch(fetcher: &Fetcher, scene: &Scene, name: &str) -> Result<Self, TerrainError> {
-        let zone = scene.zones.iter().find(|zone| zone.name == name).ok_or_else(|| TerrainError::Zone {
+    /// The scene's zone of this name.
+    fn find(scene: &Scene, name: &str) -> Result<Zone, TerrainError> {
+        let found = scene.zones.iter().find(|zone| zone.name == name);
+        found.cloned().ok_or_else(|| TerrainError::Zone {
             scene: scene.name.clone(),
             asked: name.to_owned(),
             zones: scene.zones.iter().map(|zone| zone.name.clone()).collect(),
-        })?;
-        Ok(Self { zone: zone.clone(), masks: fetcher.masks(name)? })
+        })
     }
 
     /// What counts of a layer's errors.
@@ -274,12 +276,20 @@ struct LayerState {
 }
 
 impl Terrain {
-    /// Opens a scene: reads its description, waiting for it, and starts the threads. `url` as for
-    /// [`Fetcher::open`].
+    /// As [`Terrain::connect`], waiting for it.
     ///
     /// # Errors
     /// When there is no such scene, or this build cannot show it.
+    #[cfg(not(target_arch = "wasm32"))]
     pub fn open(url: &str, options: Options) -> Result<Self, TerrainError> {
+        pollster::block_on(Self::connect(url, options))
+    }
+
+    /// Opens a scene: reads its description, and starts what fetches and decodes. `url` as for [`Fetcher::connect`].
+    ///
+    /// # Errors
+    /// When there is no such scene, or this build cannot show it.
+    pub async fn connect(url: &str, options: Options) -> Result<Self, TerrainError> {
         if options.tolerance_pixels.is_nan() || options.tolerance_pixels <= 0.0 {
             return Err(TerrainError::Tolerance(options.tolerance_pixels));
         }
@@ -290,7 +300,7 @@ impl Terrain {
             return Err(TerrainError::Still);
         }
         let opened = Instant::now();
-        let (fetcher, scene) = Fetcher::open(url, &options.fetch)?;
+        let (fetcher, scene) = Fetcher::connect(url, &options.fetch).await?;
         let encoding = options.fetch.encoding;
         if let Some(layer) = scene.layers.iter().find(|layer| encoding.layer(layer).is_none()) {
             return Err(TerrainError::Encoding {
@@ -299,7 +309,13 @@ impl Terrain {
                 asked: encoding.name(),
             });
         }
-        let view = options.zone.as_deref().map(|name| ZoneView::fetch(&fetcher, &scene, name)).transpose()?;
+        let view = match options.zone.as_deref() {
+            Some(name) => {
+                let zone = ZoneView::find(&scene, name)?;
+                Some(ZoneView { masks: fetcher.masks(name).await?, zone })
+            }
+            None => None,
+        };
         let share = options.memory_bytes / scene.layers.len() / 4 * 3;
         let state = |layer: &Layer| LayerState {
             index: Index::new(layer.forest),
@@ -487,15 +503,18 @@ impl Terrain {
 
     /// Repeats frames until all that the ideal cut wants is there and stands still, or nothing more can come, or the
     /// time is up. For pictures without a window.
+    #[cfg(not(target_arch = "wasm32"))]
     pub fn settle(&mut self, camera: &Camera, timeout: Duration) -> FrameView {
         self.wait(camera, None, timeout)
     }
 
     /// As [`Terrain::settle`], at one moment of the caller's clock: what moves does not come to rest meanwhile.
+    #[cfg(not(target_arch = "wasm32"))]
     pub fn settle_at(&mut self, camera: &Camera, seconds: f64, timeout: Duration) -> FrameView {
         self.wait(camera, Some(seconds), timeout)
     }
 
+    #[cfg(not(target_arch = "wasm32"))]
     fn wait(&mut self, camera: &Camera, seconds: Option<f64>, timeout: Duration) -> FrameView {
         let until = Instant::now() + timeout;
         loop {

@@ -2,7 +2,7 @@
 
 use crate::client_program::{self, NoClient};
 use crate::hierarchy::{self, BuildError, Options};
-use crate::http::{ServeError, Server};
+use crate::http::{self, ServeError, Server};
 use crate::ingest::{self, IngestError};
 use crate::progress::Progress;
 use crate::sample;
@@ -74,14 +74,17 @@ pub fn run(folder: &Path, samples: u32, listen: SocketAddr, headless: bool) -> R
         "  {} diamonds, {} bytes, {:.2} bits a sample at 0.5 m, {:.1} s",
         report.diamonds, report.point_bytes, report.bits_per_sample, report.seconds
     ));
-    let server = match Server::open(std::slice::from_ref(&store), listen) {
+    let options = http::Options { web: http::web_folder(), ..http::Options::default() };
+    let open = |listen| Server::open_with(std::slice::from_ref(&store), listen, &options);
+    let server = match open(listen) {
         Err(ServeError::Listen { error, .. }) if error.kind() == io::ErrorKind::AddrInUse => {
             say(&format!("Port {} is taken; using a free one.", listen.port()));
-            Server::open(std::slice::from_ref(&store), SocketAddr::new(listen.ip(), 0))?
+            open(SocketAddr::new(listen.ip(), 0))?
         }
         other => other?,
     };
     let url = format!("{}/scenes/sample", server.address());
+    let page = server.has_viewer().then(|| format!("{}/", server.address()));
     let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
     std::thread::scope(|scope| {
         let serving = scope.spawn(move || {
@@ -102,6 +105,9 @@ pub fn run(folder: &Path, samples: u32, listen: SocketAddr, headless: bool) -> R
                 say(&format!("Serving {url}\nGo on with, for instance:"));
                 url.clone()
             };
+            if let Some(page) = page.filter(|_| !headless) {
+                say(&format!("  a browser, at {page}"));
+            }
             let [eye, target] = NEAR.map(|view| position(view, samples));
             say(&format!("  {program} render {url} -o near.png --eye {eye} --target {target}"));
             let [x, y] = sample::place(NEAR[1][0], NEAR[1][1], samples);

@@ -13,6 +13,7 @@
 //! | `routes`, `answer`, `many` | what each kind of address is answered with |
 //! | `contract` | the same, told as OpenAPI |
 //! | `scenes`, `blobs` | what is served: versions that change, and blobs, the hot ones in memory |
+//! | `viewer` | the browser's viewer: its page and files |
 //! | `metrics` | what is counted |
 
 mod accept;
@@ -28,10 +29,12 @@ mod routes;
 mod scenes;
 mod still;
 mod tls;
+mod viewer;
 
 pub use access::{TokensError, new_token};
 pub use limits::Limits;
 pub use tls::TlsError;
+pub use viewer::ViewerError;
 
 use crate::store::{Disk, Shared, Store, StoreError};
 use access::{Access, Caller};
@@ -45,6 +48,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 use tls::Tls;
+use viewer::Viewer;
 
 /// Why a server cannot start or stops.
 #[derive(Debug, thiserror::Error)]
@@ -70,6 +74,9 @@ pub enum ServeError {
     /// The certificate cannot be used.
     #[error(transparent)]
     Tls(#[from] TlsError),
+    /// The browser's viewer cannot be read.
+    #[error(transparent)]
+    Viewer(#[from] ViewerError),
     /// The address cannot be listened on.
     #[error("cannot listen on {address}: {error}{}", match error.kind() {
         std::io::ErrorKind::AddrInUse => "; another program has that port: choose another with --listen, for instance --listen 127.0.0.1:0 for any free one",
@@ -97,6 +104,8 @@ pub struct Options {
     pub tokens: Option<PathBuf>,
     /// The files of a certificate and its key, both PEM: with them, what is sent is encrypted.
     pub certificate: Option<(PathBuf, PathBuf)>,
+    /// The folder with the browser's viewer, which `make web` writes.
+    pub web: Option<PathBuf>,
     /// A folder for pieces of object stores, and how many bytes it may take.
     pub disk_cache: Option<(PathBuf, u64)>,
 }
@@ -115,6 +124,7 @@ struct Site {
     scenes: Scenes,
     blobs: Arc<Blobs>,
     access: Access,
+    viewer: Option<Viewer>,
     metrics: Arc<Metrics>,
 }
 
@@ -133,6 +143,7 @@ pub struct Server {
     scenes: Scenes,
     shared: Arc<Shared>,
     access: Access,
+    viewer: Option<Viewer>,
     tls: Option<Arc<Tls>>,
     listener: TcpListener,
     address: SocketAddr,
@@ -158,17 +169,24 @@ impl Server {
         let tls = tls.transpose()?.map(Arc::new);
         let shared = options.shared()?;
         let scenes = Scenes::open(stores, &shared)?;
+        let viewer = options.web.as_deref().map(Viewer::open).transpose()?;
         let failed = |error| ServeError::Listen { address: listen, error };
         let listener = TcpListener::bind(listen).map_err(failed)?;
         listener.set_nonblocking(true).map_err(failed)?;
         let address = listener.local_addr().map_err(failed)?;
-        Ok(Self { scenes, shared, access, tls, listener, address, limits: options.limits })
+        Ok(Self { scenes, shared, access, viewer, tls, listener, address, limits: options.limits })
     }
 
     /// Where the server listens, as a URL.
     #[must_use]
     pub fn address(&self) -> String {
         format!("http{}://{}", if self.tls.is_some() { "s" } else { "" }, self.address)
+    }
+
+    /// Whether the browser's viewer is at its address.
+    #[must_use]
+    pub fn has_viewer(&self) -> bool {
+        self.viewer.is_some()
     }
 
     /// The names of its scenes.
@@ -204,7 +222,8 @@ impl Server {
             let listener = tokio::net::TcpListener::from_std(self.listener)?;
             let metrics = Arc::new(Metrics::new(self.shared));
             let blobs = Arc::new(Blobs::new(self.limits.cache, Arc::clone(&metrics)));
-            let site = Arc::new(Site { scenes: self.scenes, blobs, access: self.access, metrics });
+            let (scenes, access, viewer) = (self.scenes, self.access, self.viewer);
+            let site = Arc::new(Site { scenes, blobs, access, viewer, metrics });
             let front = Arc::new(Front::new(Arc::clone(&site), &self.limits));
             tokio::spawn(watch(site, Arc::clone(&front), self.tls.clone(), self.limits));
             accept::serve(listener, front, self.tls, self.limits, stop).await;
@@ -222,6 +241,7 @@ pub fn check(stores: &[PathBuf], options: &Options) -> Result<Vec<String>, Serve
     if let Some((certificate, key)) = &options.certificate {
         Tls::open(certificate, key)?;
     }
+    options.web.as_deref().map(Viewer::open).transpose()?;
     // The disk cache may be in use by the server that these settings are for.
     Ok(Scenes::open(stores, &Arc::default())?.all().iter().map(|store| store.scene().name.clone()).collect())
 }
@@ -251,6 +271,14 @@ async fn watch(site: Arc<Site>, front: Arc<Front>, tls: Option<Arc<Tls>>, limits
             tracing::error!("looking for what has changed failed; it is tried again");
         }
     }
+}
+
+/// Where the browser's viewer lies if nobody says: beside this program, or where `make web` has put it.
+#[must_use]
+pub fn web_folder() -> Option<PathBuf> {
+    let program = std::env::current_exe().ok()?;
+    let beside = program.ancestors().skip(1).take(2).map(|folder| folder.join("web"));
+    beside.into_iter().find(|folder| folder.join("index.html").is_file())
 }
 
 /// Asks the server at `address` whether it is well.

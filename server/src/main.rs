@@ -690,7 +690,14 @@ fn serving(settings: &Settings) -> Result<http::Options, Failure> {
     }
     let certificate = settings.certificate().map_err(|e| Failure(2, e.to_string()))?;
     let disk_cache = settings.disk_cache.clone().map(|folder| (folder, settings.disk_cache_size));
-    Ok(http::Options { limits: settings.limits, tokens: settings.tokens.clone(), certificate, disk_cache })
+    let web = settings.web.clone().or_else(http::web_folder);
+    Ok(http::Options {
+        limits: settings.limits,
+        tokens: settings.tokens.clone(),
+        certificate,
+        disk_cache,
+        web,
+    })
 }
 
 fn serve(given: &ArgMatches, config: Option<PathBuf>) -> Result<(), Failure> {
@@ -701,7 +708,10 @@ fn serve(given: &ArgMatches, config: Option<PathBuf>) -> Result<(), Failure> {
     }
     let server = http::Server::open_with(&settings.stores, settings.listen, &serving(&settings)?)?;
     let mut out = std::io::stdout().lock();
-    let printed = writeln!(out, "Serving {} at {}", server.scenes().join(", "), server.address());
+    let mut printed = writeln!(out, "Serving {} at {}", server.scenes().join(", "), server.address());
+    if server.has_viewer() {
+        printed = printed.and_then(|()| writeln!(out, "Open {}/ in a browser", server.address()));
+    }
     shown(printed.and_then(|()| out.flush()))?;
     drop(out);
     Ok(server.run_until_signal()?)

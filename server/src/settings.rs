@@ -47,6 +47,10 @@ pub struct Settings {
     /// The most bytes that --disk-cache takes
     #[arg(long, default_value = "10GiB", value_name = "BYTES", value_parser = parse_bytes)]
     pub disk_cache_size: u64,
+    /// The folder with the viewer for browsers, which `make web` writes [default: web, beside this program or a folder up,
+    /// if it is there]
+    #[arg(long, value_name = "FOLDER")]
+    pub web: Option<PathBuf>,
     /// How the log is written, on standard error; RUST_LOG says how much: info has a line for each request
     #[arg(long, default_value = "text", value_enum)]
     pub log_format: LogFormat,

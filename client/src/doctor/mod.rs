@@ -118,12 +118,12 @@ pub fn examine(url: &str, token: Option<&str>, mut tell: impl FnMut(Finding)) ->
     let (base, name) = parse_address(url)?;
     let start = |e: &dyn fmt::Display| FetchError::Start(e.to_string());
     let server = Server {
-        client: connect::client(&base, PATIENCE, token)?,
+        client: connect::builder(&base, token)?.read_timeout(PATIENCE).build().map_err(|e| start(&e))?,
         base: base.as_str().trim_end_matches('/').to_owned(),
     };
     // A connection of its own that may only be HTTP/2, as a balancer before the server would open it.
     let plain = base.scheme() == "http";
-    let prior = connect::builder(&base, PATIENCE, token)?.http2_prior_knowledge();
+    let prior = connect::builder(&base, token)?.read_timeout(PATIENCE).http2_prior_knowledge();
     let http2 = plain.then(|| prior.build()).transpose().map_err(|e| start(&e))?;
     let runtime =
         tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(|e| start(&e))?;

@@ -1,13 +1,16 @@
 //! One server over HTTP: addresses, answers and their limits, and what has gone over the wire.
 
+use super::unpack::unpack;
 use super::{FetchError, TRIES_MAX, Traffic};
+use crate::background::{sleep, within};
 use bytes::Bytes;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::{self, Entry};
 use diamantina_protocol::message::{self, Catalogue, Layer, Scene};
 use diamantina_protocol::zone::{self, Mask};
-use reqwest::{Client, Response, StatusCode, Url};
+use futures_util::StreamExt as _;
+use reqwest::{Client, StatusCode, Url};
 use std::hash::BuildHasher;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -40,15 +43,17 @@ pub(crate) fn parse_address(text: &str) -> Result<(Url, Option<String>), FetchEr
     if url.host_str().is_none() {
         return Err(wrong("it has no host"));
     }
+    // As the page in a browser names a scene.
+    let asked = url.query_pairs().find(|(word, _)| word == "scene").map(|(_, name)| name.into_owned());
     url.set_query(None);
     url.set_fragment(None);
     let path = url.path().trim_end_matches('/').to_owned();
     let (prefix, name) = match path.rsplit_once("/scenes/") {
         Some((prefix, name)) => (prefix, Some(name)),
-        None => (path.strip_suffix("/scenes").unwrap_or(&path), None),
+        None => (path.strip_suffix("/scenes").unwrap_or(&path), asked.as_deref()),
     };
     if name.is_some_and(|name| !message::is_name(name)) {
-        return Err(wrong("after /scenes/ comes one name"));
+        return Err(wrong("after /scenes/ or ?scene= comes one name"));
     }
     url.set_path(prefix);
     Ok((url, name.map(str::to_owned)))
@@ -138,16 +143,24 @@ pub(super) fn count(counter: &AtomicU64, more: usize) {
 pub(super) struct Http {
     pub(super) client: Client,
     pub(super) base: String,
+    /// How long nothing may come before a request is given up.
+    pub(super) patience: Duration,
     pub(super) traffic: Counters,
 }
 
+/// The body of an answer, as it comes. In a browser it stays with the thread that asked.
+#[cfg(not(target_arch = "wasm32"))]
+type Chunks = futures_util::stream::BoxStream<'static, reqwest::Result<Bytes>>;
+#[cfg(target_arch = "wasm32")]
+type Chunks = futures_util::stream::LocalBoxStream<'static, reqwest::Result<Bytes>>;
+
 impl Http {
-    pub(super) async fn get(&self, route: &str) -> Result<Response, FetchError> {
+    pub(super) async fn get(&self, route: &str) -> Result<Chunks, FetchError> {
         count(&self.traffic.requests, 1);
-        let response =
-            self.client.get(format!("{}{route}", self.base)).send().await.map_err(|e| transport(&e))?;
+        let sent = self.client.get(format!("{}{route}", self.base)).send();
+        let response = self.in_time(sent).await?;
         if response.status() == StatusCode::OK {
-            return Ok(response);
+            return Ok(Box::pin(response.bytes_stream()));
         }
         let retry_after = response.headers().get("retry-after").and_then(|v| v.to_str().ok()?.parse().ok());
         Err(FetchError::Status {
@@ -157,16 +170,23 @@ impl Http {
         })
     }
 
-    pub(super) async fn chunk(&self, response: &mut Response) -> Result<Option<Bytes>, FetchError> {
-        let chunk = response.chunk().await.map_err(|e| transport(&e))?;
+    async fn in_time<T>(&self, coming: impl Future<Output = reqwest::Result<T>>) -> Result<T, FetchError> {
+        match within(self.patience, coming).await {
+            Some(come) => come.map_err(|e| transport(&e)),
+            None => Err(FetchError::Transport(format!("nothing came for {:.0?}", self.patience))),
+        }
+    }
+
+    pub(super) async fn chunk(&self, chunks: &mut Chunks) -> Result<Option<Bytes>, FetchError> {
+        let chunk = self.in_time(async { chunks.next().await.transpose() }).await?;
         count(&self.traffic.bytes, chunk.as_ref().map_or(0, Bytes::len));
         Ok(chunk)
     }
 
     pub(super) async fn whole(&self, route: &str, limit: usize) -> Result<Vec<u8>, FetchError> {
-        let mut response = self.get(route).await?;
+        let mut chunks = self.get(route).await?;
         let mut body = Vec::new();
-        while let Some(chunk) = self.chunk(&mut response).await? {
+        while let Some(chunk) = self.chunk(&mut chunks).await? {
             if body.len() + chunk.len() > limit {
                 return Err(FetchError::TooLarge { route: shortened(route), limit });
             }
@@ -198,14 +218,15 @@ impl Http {
                     count(&self.traffic.errors, 1);
                     let asked =
                         if let FetchError::Status { retry_after, .. } = error { retry_after } else { None };
-                    tokio::time::sleep(pause(tries, asked)).await;
+                    sleep(pause(tries, asked)).await;
                 }
                 answer => break answer?,
             }
         };
         let wrong = |reason: String| FetchError::Zone { zone: zone.to_owned(), reason };
-        let bytes =
-            zstd::bulk::decompress(&blob, zone::bytes_max(forests)).map_err(|e| wrong(e.to_string()))?;
+        let limit = zone::bytes_max(forests);
+        let bytes = unpack(&blob, limit)
+            .ok_or_else(|| wrong(format!("they do not decompress to at most {limit} bytes")))?;
         zone::decode(forests, &bytes).map_err(|e| wrong(e.to_string()))
     }
 
@@ -222,7 +243,7 @@ impl Http {
             match answer {
                 Err(FetchError::Status { status: 429 | 500.., retry_after, .. }) if tries < TRIES_MAX => {
                     count(&self.traffic.errors, 1);
-                    tokio::time::sleep(pause(tries, retry_after)).await;
+                    sleep(pause(tries, retry_after)).await;
                 }
                 answer => break answer?,
             }
@@ -251,7 +272,7 @@ pub(crate) fn decode_page(
     number: u32,
     blob: &[u8],
 ) -> Result<Vec<(Diamond, Entry)>, FetchError> {
-    let page = zstd::bulk::decompress(blob, PAGE_BYTES_MAX).map_err(|_| FetchError::Compression(number))?;
+    let page = unpack(blob, PAGE_BYTES_MAX).ok_or(FetchError::Compression(number))?;
     Ok(index::decode(forest, number, &page)?)
 }
 
@@ -297,7 +318,14 @@ mod tests {
             ("https://h/".to_owned(), Some("alps".to_owned()))
         );
         assert_eq!(parse("http://h/deep/scenes/alps?x#y").unwrap(), at("http://h/deep", Some("alps")));
-        for bad in ["", "h:80", "ftp://h/", "http://h/scenes/a/b/c", "http://h/scenes/.x"] {
+        assert_eq!(
+            parse("http://h:80/?scene=alps&error=2#1,2,3,4,5").unwrap(),
+            at("http://h/", Some("alps"))
+        );
+        assert_eq!(parse("http://h/deep/?scene=alps").unwrap(), at("http://h/deep", Some("alps")));
+        for bad in
+            ["http://h/?scene=../x", "", "h:80", "ftp://h/", "http://h/scenes/a/b/c", "http://h/scenes/.x"]
+        {
             assert!(matches!(parse(bad), Err(FetchError::Address { .. })), "{bad}");
         }
     }

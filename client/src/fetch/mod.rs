@@ -1,7 +1,7 @@
 //! Requests: by priority, a few at a time, retried, dropped when nobody wants them any more.
 //!
 //! A frame tells what it wishes for, in order, and takes what has arrived; it never waits. The work is done
-//! by a few tasks on a runtime with threads of its own. Each takes the first wish that nobody is fetching:
+//! by a few tasks on threads of their own, or by the browser. Each takes the first wish that nobody is fetching:
 //! a page of the index, or as many diamonds as make a good batch. A batch is read frame by frame as its
 //! bytes arrive, so a slow answer gives its first diamonds early.
 //!
@@ -18,6 +18,7 @@
 //! | `tasks` | the wishes and the tasks that fulfil them |
 //! | `stream` | what comes without being wished for, and when it ends |
 //! | `batch` | batches: put together, and cut from a stream of bytes |
+//! | `unpack` | zstd |
 //! | `error` | why something was not fetched |
 
 mod batch;
@@ -26,6 +27,7 @@ mod error;
 mod http;
 mod stream;
 mod tasks;
+mod unpack;
 
 #[cfg(test)]
 mod tests;
@@ -33,8 +35,11 @@ mod tests;
 pub use batch::ROOT_BYTES;
 pub use error::FetchError;
 pub use http::LAYERS_MAX;
-pub(crate) use http::{check as check_scene, decode_page, parse_address, transport};
+pub(crate) use http::parse_address;
+#[cfg(not(target_arch = "wasm32"))]
+pub(crate) use http::{check as check_scene, decode_page, transport};
 
+use crate::background::Background;
 use crate::encoding::Encoding;
 use bytes::Bytes;
 use diamantina_protocol::diamond::Diamond;
@@ -48,7 +53,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, mpsc};
 use std::time::Duration;
 use tasks::{Shared, work};
-use tokio::sync::Notify;
+use tokio::sync::{Notify, oneshot};
 
 /// Bytes of payloads asked for in one batch, where the index tells: about a second at 2 Mbit/s.
 pub const BATCH_BYTES: u64 = 256 << 10;
@@ -154,45 +159,35 @@ pub struct Fetcher {
     events: mpsc::Receiver<(u64, Event)>,
     /// The last event that was taken.
     seen: u64,
-    runtime: Option<tokio::runtime::Runtime>,
+    background: Background,
 }
 
 impl Fetcher {
-    /// Reads the scene's description, waiting for it, and starts. `url` is that of a scene,
-    /// `http://HOST:PORT/scenes/NAME` (or https), or of a server with only one. Layers that are offered in the encoding asked for
-    /// come as they are streamed in it: see [`Encoding::layer`].
+    /// Reads the scene's description and starts. `url` is that of a scene, `http://HOST:PORT/scenes/NAME` (or https),
+    /// or of a server with only one. Layers that are offered in the encoding asked for come as they are streamed in it: see
+    /// [`Encoding::layer`].
     ///
     /// # Errors
     /// When there is no such scene, or it cannot be shown.
-    pub fn open(url: &str, options: &Options) -> Result<(Self, Scene), FetchError> {
+    pub async fn connect(url: &str, options: &Options) -> Result<(Self, Scene), FetchError> {
         let (base, name) = parse_address(url)?;
         let start = |e: &dyn std::fmt::Display| FetchError::Start(e.to_string());
-        let runtime = tokio::runtime::Builder::new_multi_thread()
-            .worker_threads(2)
-            .thread_name("diamantina-fetch")
-            .enable_all()
-            .build()
-            .map_err(|e| start(&e))?;
+        let background = Background::start("diamantina-fetch").map_err(|e| start(&e))?;
         let http = Http {
-            client: connect::client(&base, options.patience, options.token.as_deref())?,
+            client: connect::client(&base, options.token.as_deref())?,
             base: base.as_str().trim_end_matches('/').to_owned(),
+            patience: options.patience,
             traffic: Counters::default(),
         };
-        // Not block_on: the caller may stand in a runtime of its own.
-        let (sender, receiver) = mpsc::sync_channel(1);
-        runtime.spawn(async move {
+        // Whoever awaits this may stand in a runtime of its own, or in none.
+        let (sender, receiver) = oneshot::channel();
+        background.spawn(async move {
             let found = http.scene(name.as_deref()).await;
             // Whoever asked waits for this.
             let _ = sender.send((http, found));
         });
-        let (http, scene) = receiver.recv().map_err(|e| start(&e))?;
-        let mut scene = match scene {
-            Ok(scene) => scene,
-            Err(e) => {
-                runtime.shutdown_background();
-                return Err(e);
-            }
-        };
+        let (http, scene) = receiver.await.map_err(|e| start(&e))?;
+        let mut scene = scene?;
         let forests = scene.layers.iter().map(|layer| layer.forest).collect();
         for layer in &mut scene.layers {
             if let Some(streamed) = options.encoding.layer(layer) {
@@ -214,9 +209,18 @@ impl Fetcher {
             sender,
         });
         for _ in 0..requests_max {
-            runtime.spawn(work(Arc::clone(&shared)));
+            background.spawn(work(Arc::clone(&shared)));
         }
-        Ok((Self { shared, events, seen: 0, runtime: Some(runtime) }, scene))
+        Ok((Self { shared, events, seen: 0, background }, scene))
+    }
+
+    /// As [`Fetcher::connect`], waiting for it.
+    ///
+    /// # Errors
+    /// When there is no such scene, or it cannot be shown.
+    #[cfg(not(target_arch = "wasm32"))]
+    pub fn open(url: &str, options: &Options) -> Result<(Self, Scene), FetchError> {
+        pollster::block_on(Self::connect(url, options))
     }
 
     /// The scene's address.
@@ -226,21 +230,18 @@ impl Fetcher {
         format!("{}{}", http.base, scene_route(&scene.name))
     }
 
-    /// The masks of one of the scene's zones, one a layer, of the diamonds of its points; waits for them.
+    /// The masks of one of the scene's zones, one a layer, of the diamonds of its points.
     ///
     /// # Errors
     /// When they do not come, or are none.
-    pub fn masks(&self, zone: &str) -> Result<Vec<Mask>, FetchError> {
-        let stopped = || FetchError::Start("the runtime has ended".to_owned());
-        let runtime = self.runtime.as_ref().ok_or_else(stopped)?;
-        // Not block_on: the caller may stand in a runtime of its own.
-        let (sender, receiver) = mpsc::sync_channel(1);
+    pub fn masks(&self, zone: &str) -> impl Future<Output = Result<Vec<Mask>, FetchError>> + use<> {
+        let (sender, receiver) = oneshot::channel();
         let (shared, zone) = (Arc::clone(&self.shared), zone.to_owned());
-        runtime.spawn(async move {
+        self.background.spawn(async move {
             // Whoever asked waits for this.
             let _ = sender.send(shared.http.masks(&shared.scene, &shared.forests, &zone).await);
         });
-        receiver.recv().map_err(|_| stopped())?
+        async { receiver.await.map_err(|e| FetchError::Start(e.to_string()))? }
     }
 
     /// The next event that has arrived, without waiting.
@@ -330,13 +331,5 @@ impl Fetcher {
     #[must_use]
     pub fn traffic(&self) -> Traffic {
         self.shared.http.traffic.read()
-    }
-}
-
-impl Drop for Fetcher {
-    fn drop(&mut self) {
-        if let Some(runtime) = self.runtime.take() {
-            runtime.shutdown_background();
-        }
     }
 }

@@ -67,11 +67,11 @@ impl Shared {
     pub(super) async fn stream(&self, layer: usize, ask: &StreamAsk) -> Result<(), FetchError> {
         let layer_of = &self.scene.layers[layer];
         let route = message::stream_route(&self.scene.name, &self.scene.version, &layer_of.name, ask);
-        let mut response = self.http.get(&route).await?;
+        let mut chunks = self.http.get(&route).await?;
         let mut frames = Frames::default();
         let (diamonds, pages) = (HashSet::default(), HashSet::default());
         let mut ledger = Ledger { forest: layer_of.forest, diamonds, pages };
-        while let Some(chunk) = self.http.chunk(&mut response).await? {
+        while let Some(chunk) = self.http.chunk(&mut chunks).await? {
             frames.push(&chunk);
             while let Some((header, blob)) = frames.take()? {
                 match ledger.enter(&header, &blob)? {

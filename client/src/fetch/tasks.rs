@@ -4,6 +4,7 @@ use super::batch::{Batch, Frames};
 use super::http::{Http, PAGE_BYTES_MAX, count, decode_page, pause, shortened};
 use super::stream::weight;
 use super::{Event, FetchError, Key, REST, TRIES_MAX, Want};
+use crate::background::within;
 use crate::encoding::Encoding;
 use bytes::Bytes;
 use diamantina_protocol::bintree::Forest;
@@ -13,8 +14,8 @@ use foldhash::fast::RandomState;
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
-use std::time::Instant;
 use tokio::sync::Notify;
+use web_time::Instant;
 
 #[derive(Debug)]
 pub(super) struct Shared {
@@ -105,7 +106,7 @@ pub(super) async fn work(shared: Arc<Shared>) {
         match shared.next() {
             Next::Wait(None) => changed.await,
             Next::Wait(Some(until)) => {
-                let _ = tokio::time::timeout_at(until.into(), changed).await;
+                let _ = within(until.saturating_duration_since(Instant::now()), changed).await;
             }
             Next::Fetch { id, cancel, request } => {
                 let done = tokio::select! {
@@ -221,12 +222,12 @@ impl Shared {
             Request::Batch(layer, wants) => {
                 let centres: Vec<_> = wants.iter().map(|(d, _)| d.centre()).collect();
                 let route = self.encoding.batch_route(&self.scene, *layer, &centres);
-                let mut response = self.http.get(&route).await?;
+                let mut chunks = self.http.get(&route).await?;
                 let mut owed: HashMap<[u32; 2], (Diamond, Option<u32>)> =
                     wants.iter().map(|want| (want.0.centre(), *want)).collect();
                 let mut frames = Frames::default();
                 let mut bad = None;
-                while let Some(chunk) = self.http.chunk(&mut response).await? {
+                while let Some(chunk) = self.http.chunk(&mut chunks).await? {
                     frames.push(&chunk);
                     while let Some((header, payload)) = frames.take()? {
                         let centre = header.centre;

@@ -12,12 +12,14 @@
 //! indirect draws. Depth is reversed and infinite, positions are relative to the eye.
 
 mod frame;
+#[cfg(not(target_arch = "wasm32"))]
 mod offscreen;
 mod resident;
 
 #[cfg(test)]
 mod tests;
 
+#[cfg(not(target_arch = "wasm32"))]
 pub use offscreen::Offscreen;
 
 use crate::camera::{Camera, nearest_drawn};
@@ -180,20 +182,27 @@ pub struct FrameStats {
     pub gpu_bytes: u64,
 }
 
+/// What helps where there is no adapter, and where there is no device.
+const ADVICE: [&str; 2] = if cfg!(target_arch = "wasm32") {
+    [
+        "this browser offers neither WebGPU nor WebGL2: switch hardware acceleration on in its settings, or use another",
+        "update the browser and the driver, or use another browser",
+    ]
+} else {
+    [
+        "install a Vulkan driver, for example the software one of the Debian package mesa-vulkan-drivers",
+        "update its driver, or use a software one, for example mesa-vulkan-drivers of Debian",
+    ]
+};
+
 /// Why there is no picture.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum RenderError {
     /// The machine has no graphics driver that fits.
-    #[error(
-        "no graphics adapter ({0}): install a Vulkan driver, for example the software one of the Debian \
-         package mesa-vulkan-drivers"
-    )]
+    #[error("no graphics adapter ({0}): {advice}", advice = ADVICE[0])]
     NoAdapter(String),
     /// The adapter refused.
-    #[error(
-        "the graphics adapter gives no device: {0}: update its driver, or use a software one, for example \
-         mesa-vulkan-drivers of Debian"
-    )]
+    #[error("the graphics adapter gives no device: {0}: {advice}", advice = ADVICE[1])]
     Device(String),
     /// A size that cannot be drawn.
     #[error("picture of {} x {} pixels: expected 1 to {limit} each way", found[0], found[1])]
@@ -208,34 +217,42 @@ pub enum RenderError {
     Read(String),
 }
 
-/// The system's graphics, as far as they are more than WebGL2.
-pub(crate) fn instance() -> wgpu::Instance {
+/// What draws: on a machine its own graphics, as far as they are more than WebGL2; in a browser WebGPU, or WebGL2 where it
+/// has no other.
+pub(crate) const BACKENDS: wgpu::Backends = if cfg!(target_arch = "wasm32") {
+    wgpu::Backends::BROWSER_WEBGPU.union(wgpu::Backends::GL)
+} else {
+    wgpu::Backends::PRIMARY
+};
+
+/// The system's graphics, of these kinds.
+pub(crate) async fn instance(backends: wgpu::Backends) -> wgpu::Instance {
     let mut description = wgpu::InstanceDescriptor::new_without_display_handle();
-    description.backends = wgpu::Backends::PRIMARY;
-    wgpu::Instance::new(description)
+    description.backends = backends;
+    wgpu::util::new_instance_with_webgpu_detection(description).await
 }
 
 /// The best adapter that there is, in software if need be, of those that draw on a surface if there is one; and a device
 /// of it.
-pub(crate) fn device(
+pub(crate) async fn device(
     instance: &wgpu::Instance,
     surface: Option<&wgpu::Surface<'_>>,
     label: &str,
 ) -> Result<(wgpu::Adapter, wgpu::Device, wgpu::Queue), RenderError> {
-    let adapter = pollster::block_on(instance.request_adapter(&wgpu::RequestAdapterOptions {
+    let request = instance.request_adapter(&wgpu::RequestAdapterOptions {
         power_preference: wgpu::PowerPreference::HighPerformance,
         compatible_surface: surface,
         ..Default::default()
-    }))
-    .map_err(|e| RenderError::NoAdapter(e.to_string()))?;
+    });
+    let adapter = request.await.map_err(|e| RenderError::NoAdapter(e.to_string()))?;
     // No more than a browser has, so that whatever works here works there.
     let limits = wgpu::Limits::downlevel_webgl2_defaults().using_resolution(adapter.limits());
-    let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
+    let request = adapter.request_device(&wgpu::DeviceDescriptor {
         label: Some(label),
         required_limits: limits,
         ..Default::default()
-    }))
-    .map_err(|e| RenderError::Device(e.to_string()))?;
+    });
+    let (device, queue) = request.await.map_err(|e| RenderError::Device(e.to_string()))?;
     Ok((adapter, device, queue))
 }
 

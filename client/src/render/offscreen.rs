@@ -1,6 +1,6 @@
 //! Pictures without a window.
 
-use super::{FrameStats, Look, Options, RenderError, Renderer, device, instance};
+use super::{BACKENDS, FrameStats, Look, Options, RenderError, Renderer, device, instance};
 use crate::camera::Camera;
 use crate::drawing::DrawItem;
 use crate::picture::Picture;
@@ -19,7 +19,8 @@ impl Offscreen {
     /// # Errors
     /// When there is no adapter, or it gives no device.
     pub fn new(options: &Options) -> Result<Self, RenderError> {
-        let (_, device, queue) = device(&instance(), None, "offscreen")?;
+        let found = async { device(&instance(BACKENDS).await, None, "offscreen").await };
+        let (_, device, queue) = pollster::block_on(found)?;
         let options = Options { format: wgpu::TextureFormat::Rgba8UnormSrgb, ..*options };
         Ok(Self { renderer: Renderer::new(device, queue, &options), target: None })
     }

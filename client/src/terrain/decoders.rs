@@ -1,6 +1,8 @@
-//! Threads that decode payloads whose parents are there, and hold the others.
+//! Decodes payloads whose parents are there, and holds the others: on threads, or, where there are none, between
+//! frames, a slice after the other.
 
 use super::DONE_MAX;
+use crate::background::{Background, HAS_THREADS, sleep};
 use crate::cache::Key;
 use crate::encoding::Encoding;
 use crate::surface::{Surface, SurfaceError};
@@ -11,6 +13,11 @@ use foldhash::fast::RandomState;
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
+use std::time::Duration;
+use web_time::Instant;
+
+/// How long decoding goes on at once where frames wait for it.
+const SLICE: Duration = Duration::from_millis(4);
 
 /// A payload with its parents' surfaces, as far as they are there.
 #[derive(Debug)]
@@ -27,11 +34,13 @@ impl Job {
 
 pub(super) type Decoded = (Key, Result<Arc<Surface>, SurfaceError>);
 
-/// Threads that decode payloads whose parents are there, and hold the others.
+/// Decodes payloads whose parents are there, and holds the others.
 #[derive(Debug)]
 pub(super) struct Decoders {
     shared: Arc<Bench>,
     threads: Vec<JoinHandle<()>>,
+    /// What runs the slices, if there are no threads.
+    slices: Option<Background>,
 }
 
 #[derive(Debug)]
@@ -51,6 +60,8 @@ struct Jobs {
     done: Vec<Decoded>,
     fresh: HashMap<Key, Arc<Surface>, RandomState>,
     running: usize,
+    /// Whether a task goes through the slices.
+    slicing: bool,
     closed: bool,
 }
 
@@ -62,14 +73,29 @@ impl Decoders {
             state: Mutex::default(),
             changed: Condvar::new(),
         });
-        let count = std::thread::available_parallelism()?.get();
-        let mut decoders = Self { shared, threads: Vec::with_capacity(count) };
-        for _ in 0..count {
-            let bench = Arc::clone(&decoders.shared);
-            let thread = std::thread::Builder::new().name("diamantina-decode".into());
-            decoders.threads.push(thread.spawn(move || bench.work())?);
+        let mut decoders = Self { shared, threads: Vec::new(), slices: None };
+        if HAS_THREADS {
+            for _ in 0..std::thread::available_parallelism()?.get() {
+                let bench = Arc::clone(&decoders.shared);
+                let thread = std::thread::Builder::new().name("diamantina-decode".into());
+                decoders.threads.push(thread.spawn(move || bench.work())?);
+            }
+        } else {
+            decoders.slices = Some(Background::start("diamantina-decode")?);
         }
         Ok(decoders)
+    }
+
+    /// Sees to it that somebody does what there is to do.
+    fn call(&self, jobs: &mut Jobs) {
+        match &self.slices {
+            None => self.shared.changed.notify_one(),
+            Some(slices) if !jobs.slicing && !jobs.ready.is_empty() => {
+                jobs.slicing = true;
+                slices.spawn(slice(Arc::clone(&self.shared)));
+            }
+            Some(_) => {}
+        }
     }
 
     pub(super) fn submit(&self, key: Key, mut job: Job) {
@@ -79,7 +105,7 @@ impl Decoders {
         }
         if job.is_ready() {
             jobs.ready.push_back((key, job));
-            self.shared.changed.notify_one();
+            self.call(&mut jobs);
         } else {
             jobs.held.insert(key, job);
         }
@@ -92,6 +118,7 @@ impl Decoders {
         if jobs.done.len() >= DONE_MAX {
             self.shared.changed.notify_all();
         }
+        self.call(&mut jobs);
         std::mem::take(&mut jobs.done)
     }
 
@@ -138,29 +165,49 @@ impl Bench {
     fn work(&self) {
         let mut jobs = self.lock();
         while !jobs.closed {
-            let job = if jobs.done.len() < DONE_MAX { jobs.ready.pop_front() } else { None };
-            let Some((key, job)) = job else {
-                jobs = self.changed.wait(jobs).unwrap_or_else(PoisonError::into_inner);
-                continue;
+            jobs = match self.one(jobs) {
+                (jobs, true) => jobs,
+                (jobs, false) => self.changed.wait(jobs).unwrap_or_else(PoisonError::into_inner),
             };
-            jobs.running += 1;
-            drop(jobs);
-            let (layer, d) = key;
-            let parents: Vec<(Diamond, &Surface)> =
-                job.parents.iter().filter_map(|(parent, s)| Some((*parent, s.as_deref()?))).collect();
-            let layer_of = &self.scene.layers[layer];
-            let result = Surface::split(self.encoding, layer_of, d, &parents, &job.payload).map(Arc::new);
-            drop(job);
-            jobs = self.lock();
-            jobs.running -= 1;
-            if let Ok(surface) = &result {
-                jobs.fresh.insert(key, Arc::clone(surface));
-                for child in layer_of.forest.children(d).into_iter().flatten() {
-                    self.release(&mut jobs, (layer, child), d, surface);
-                }
-            }
-            jobs.done.push((key, result));
         }
+    }
+
+    /// Decodes for so long; whether there is more to do.
+    fn work_for(&self, duration: Duration) -> bool {
+        let until = Instant::now() + duration;
+        let mut jobs = self.lock();
+        loop {
+            let (after, did) = self.one(jobs);
+            jobs = after;
+            jobs.slicing = did;
+            if !did || Instant::now() >= until {
+                return did;
+            }
+        }
+    }
+
+    /// Decodes a payload, if one is ready and there is room for what becomes of it.
+    fn one<'a>(&'a self, mut jobs: MutexGuard<'a, Jobs>) -> (MutexGuard<'a, Jobs>, bool) {
+        let job = if jobs.done.len() < DONE_MAX { jobs.ready.pop_front() } else { None };
+        let Some((key, job)) = job else { return (jobs, false) };
+        jobs.running += 1;
+        drop(jobs);
+        let (layer, d) = key;
+        let parents: Vec<(Diamond, &Surface)> =
+            job.parents.iter().filter_map(|(parent, s)| Some((*parent, s.as_deref()?))).collect();
+        let layer_of = &self.scene.layers[layer];
+        let result = Surface::split(self.encoding, layer_of, d, &parents, &job.payload).map(Arc::new);
+        drop(job);
+        jobs = self.lock();
+        jobs.running -= 1;
+        if let Ok(surface) = &result {
+            jobs.fresh.insert(key, Arc::clone(surface));
+            for child in layer_of.forest.children(d).into_iter().flatten() {
+                self.release(&mut jobs, (layer, child), d, surface);
+            }
+        }
+        jobs.done.push((key, result));
+        (jobs, true)
     }
 
     /// Gives a parent to a held child, which may be all that it waits for.
@@ -175,5 +222,12 @@ impl Bench {
             jobs.ready.push_back((child, job));
             self.changed.notify_one();
         }
+    }
+}
+
+/// Decodes what is ready, a slice at a time, and lets others go on in between.
+async fn slice(bench: Arc<Bench>) {
+    while bench.work_for(SLICE) {
+        sleep(Duration::ZERO).await;
     }
 }

@@ -1,13 +1,15 @@
 //! Going over to another version of a scene that was replaced while it was looked at.
 //!
-//! What is here stays on the screen. Meanwhile the scene is opened again, on a thread, and what the view needs of it is
+//! What is here stays on the screen. Meanwhile the scene is opened again, in the background, and what the view needs of it is
 //! loaded, beside what is drawn; once it is as exact, it takes over, in one frame. While both are there, they take
 //! twice the memory.
 
 use super::{FrameView, Options, Terrain, TerrainError};
+use crate::background::aside;
 use crate::camera::Camera;
 use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
-use std::time::{Duration, Instant};
+use std::time::Duration;
+use web_time::Instant;
 
 /// How long before a scene that could not be opened again is tried once more.
 const PAUSE: Duration = Duration::from_secs(5);
@@ -21,13 +23,13 @@ pub(super) enum Reload {
     Failed(Instant),
 }
 
-/// Opens a scene on a thread. A build drops zones: without the one asked for, all of it counts.
+/// Opens a scene in the background. A build drops zones: without the one asked for, all of it counts.
 fn open(url: &str, options: &Options) -> Reload {
     let (sender, receiver) = sync_channel(1);
     let (url, options) = (url.to_owned(), options.clone());
-    let started = std::thread::Builder::new().name("diamantina-reload".to_owned()).spawn(move || {
-        let opened = match Terrain::open(&url, options.clone()) {
-            Err(TerrainError::Zone { .. }) => Terrain::open(&url, Options { zone: None, ..options }),
+    let started = aside("diamantina-reload", async move {
+        let opened = match Terrain::connect(&url, options.clone()).await {
+            Err(TerrainError::Zone { .. }) => Terrain::connect(&url, Options { zone: None, ..options }).await,
             other => other,
         };
         // Nobody waits for it any more when the terrain is dropped.
@@ -38,6 +40,7 @@ fn open(url: &str, options: &Options) -> Reload {
 
 impl Reload {
     /// Whether nothing more comes for now.
+    #[cfg(not(target_arch = "wasm32"))]
     pub(super) fn is_stuck(&self) -> bool {
         match self {
             Self::Opening(_) => false,
@@ -102,6 +105,8 @@ impl Terrain {
         let before = std::mem::replace(self, next);
         tracing::info!(version = self.scene.version, "another version of the scene took over");
         // Its threads end by and by: no frame waits for them.
-        std::thread::spawn(move || drop(before));
+        if let Err(error) = aside("diamantina-drop", async move { drop(before) }) {
+            tracing::warn!(%error, "the version before ends within a frame");
+        }
     }
 }

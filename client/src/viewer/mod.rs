@@ -3,6 +3,7 @@
 //! | module | what it holds |
 //! |---|---|
 //! | `panel` | sliders, choices, figures, and what was clicked |
+//! | `display` | a window or a canvas, and what draws on it |
 //! | [`window`] | a native window: events in, pictures out |
 //!
 //! ```text
@@ -12,13 +13,15 @@
 //! All input comes through egui, so the same code serves a window and whatever else egui runs in, and a test can press
 //! keys and drag without any window.
 
+pub(crate) mod display;
 mod panel;
+#[cfg(not(target_arch = "wasm32"))]
 pub mod window;
 
 use crate::camera::Camera;
 use crate::controls::{self, Controls, Thrust};
 use crate::drawing::DrawItem;
-use crate::headless;
+use crate::overview;
 use crate::pick::{Hit, Picker, Ray};
 use crate::render::{FrameStats, Look};
 use crate::terrain::{FrameView, Terrain};
@@ -94,9 +97,8 @@ impl Viewer {
     #[must_use]
     pub fn new(mut terrain: Terrain, url: &str, look: Look, size: [u32; 2], camera: Option<Camera>) -> Self {
         terrain.set_exaggeration(look.exaggeration);
-        let home = headless::stretched_overview(terrain.scene(), size, look.exaggeration);
-        let stretch = |p: DVec3| p.with_z(p.z * look.exaggeration);
-        let stretched = |c: Camera| Camera { eye: stretch(c.eye), target: stretch(c.target), size, ..c };
+        let home = overview::stretched_overview(terrain.scene(), size, look.exaggeration);
+        let stretched = |c: Camera| Camera { size, ..overview::stretched(&c, look.exaggeration) };
         let visible = vec![true; terrain.scene().layers.len()];
         Self {
             controls: Controls::new(stretched(camera.unwrap_or(home))),
@@ -179,17 +181,36 @@ impl Viewer {
     /// The scene's address with the view: `URL#x,y,z,heading,pitch`, metres and degrees.
     #[must_use]
     pub fn address(&self) -> String {
+        format!("{}#{}", self.url, self.view())
+    }
+
+    /// What follows the `#` of its address.
+    #[must_use]
+    pub fn view(&self) -> String {
         let eye = self.camera().eye;
         let z = eye.z / self.look.exaggeration;
         let [heading, pitch] = [self.controls.heading(), self.controls.pitch()].map(f64::to_degrees);
         let heading = heading.rem_euclid(360.0);
-        format!("{}#{:.2},{:.2},{z:.2},{heading:.3},{pitch:.3}", self.url, eye.x, eye.y)
+        format!("{:.2},{:.2},{z:.2},{heading:.3},{pitch:.3}", eye.x, eye.y)
+    }
+
+    /// Flies to where another camera is, whose heights are as they are.
+    pub fn fly_to(&mut self, camera: &Camera) {
+        let size = self.camera().size;
+        self.controls.glide_to(Camera { size, ..overview::stretched(camera, self.look.exaggeration) });
+    }
+
+    /// What drawing the last frame took.
+    #[must_use]
+    pub fn drawn(&self) -> &FrameStats {
+        &self.drawn
     }
 
     /// One frame: the panel, what keys and mouse do, and what the terrain shows then. Never waits.
     pub fn update(&mut self, ui: &mut Ui) {
         let seconds = f64::from(ui.input(|input| input.stable_dt)).min(0.1);
         panel::show(self, ui);
+        self.switch_panel(ui);
         self.steer(ui, seconds);
         self.controls.step(seconds);
         let eye = self.camera().eye;
@@ -276,7 +297,8 @@ impl Viewer {
         {
             self.mark(&hit);
         }
-        if !ui.ctx().egui_wants_keyboard_input() {
+        // A button that has the focus takes no letters.
+        if !ui.ctx().text_edit_focused() {
             self.keys(ui, seconds);
         }
     }
@@ -288,6 +310,20 @@ impl Viewer {
         if self.marks.len() > 2 {
             self.marks.remove(0);
         }
+    }
+
+    /// Opens the panel or closes it.
+    fn switch_panel(&mut self, ui: &Ui) {
+        if !is_pressed(ui, Key::Tab) {
+            return;
+        }
+        self.panel_is_open = !self.panel_is_open;
+        // To egui the key means the next widget.
+        ui.memory_mut(|memory| {
+            if let Some(focused) = memory.focused() {
+                memory.surrender_focus(focused);
+            }
+        });
     }
 
     fn keys(&mut self, ui: &Ui, seconds: f64) {
@@ -320,13 +356,7 @@ impl Viewer {
             }
             ui.ctx().request_repaint();
         }
-        let pressed = |key: Key| {
-            let is_it = |event: &Event| {
-                matches!(event, Event::Key { key: found, pressed: true, repeat: false, modifiers, .. }
-                    if *found == key && matches!(*modifiers, Modifiers::NONE | Modifiers::SHIFT))
-            };
-            ui.input(|input| input.events.iter().any(is_it))
-        };
+        let pressed = |key: Key| is_pressed(ui, key);
         if pressed(Key::H) {
             self.go_home();
         }
@@ -338,9 +368,6 @@ impl Viewer {
         }
         if pressed(Key::P) {
             self.ask_screenshot();
-        }
-        if pressed(Key::Tab) {
-            self.panel_is_open = !self.panel_is_open;
         }
         if pressed(Key::Escape) {
             self.marks.clear();
@@ -370,9 +397,8 @@ impl Viewer {
     /// Flies to where the whole scene is seen.
     fn frame_scene(&mut self) {
         let camera = self.camera();
-        let whole = headless::stretched_overview(self.terrain.scene(), camera.size, self.look.exaggeration);
-        let stretch = |p: DVec3| p.with_z(p.z * self.look.exaggeration);
-        self.controls.glide_to(Camera { eye: stretch(whole.eye), target: stretch(whole.target), ..whole });
+        let whole = overview::stretched_overview(self.terrain.scene(), camera.size, self.look.exaggeration);
+        self.controls.glide_to(overview::stretched(&whole, self.look.exaggeration));
     }
 
     fn ask_screenshot(&mut self) {
@@ -395,6 +421,15 @@ impl Viewer {
         }
         self.frozen = None;
     }
+}
+
+/// Whether a key has just gone down, alone or with Shift.
+fn is_pressed(ui: &Ui, key: Key) -> bool {
+    let is_it = |event: &Event| {
+        matches!(event, Event::Key { key: found, pressed: true, repeat: false, modifiers, .. }
+            if *found == key && matches!(*modifiers, Modifiers::NONE | Modifiers::SHIFT))
+    };
+    ui.input(|input| input.events.iter().any(is_it))
 }
 
 /// The camera of what follows the `#` of an address: see [`Viewer::address`]. `None` if it is none.

@@ -188,7 +188,10 @@ fn figures(viewer: &Viewer, ui: &mut Ui) {
         ui.colored_label(Color32::from_rgb(220, 120, 60), problem);
     }
     if viewer.terrain.scene_changed() {
-        ui.colored_label(Color32::from_rgb(220, 120, 60), "The server has another version: open it again.");
+        ui.colored_label(
+            Color32::from_rgb(220, 120, 60),
+            "The server has another version, which is being loaded.",
+        );
     }
 }
 
@@ -245,7 +248,11 @@ fn keys(ui: &mut Ui) {
         ("arrows", "look around"),
         ("H, N, F", "home, north, whole scene"),
         ("P, Tab, Esc", "picture, panel, clear"),
-        ("Ctrl+C, Ctrl+Q", "copy the view, quit"),
+        if cfg!(target_arch = "wasm32") {
+            ("Ctrl+C", "copies the view")
+        } else {
+            ("Ctrl+C, Ctrl+Q", "copy the view, quit")
+        },
     ] {
         ui.horizontal_wrapped(|ui| {
             ui.label(RichText::new(what).small().strong());

@@ -189,6 +189,21 @@ fn keys_fly_and_go_home() {
 }
 
 #[test]
+fn the_panel_comes_and_goes_and_leaves_the_keys_alone() {
+    let mut hand = Hand::new(Some(looking_down()));
+    for is_open in [false, true] {
+        hand.key(Key::Tab, true);
+        hand.key(Key::Tab, false);
+        assert_eq!(hand.viewer.panel_is_open, is_open);
+        let before = hand.camera();
+        hand.key(Key::W, true);
+        (0..5).for_each(|_| hand.frame(&[]));
+        hand.key(Key::W, false);
+        assert!(hand.camera().eye != before.eye, "keys fly");
+    }
+}
+
+#[test]
 fn a_click_tells_the_height_and_its_error() {
     let mut hand = Hand::new(Some(looking_down()));
     // The finest there is, so that the height is that of the source.

@@ -16,6 +16,8 @@ pub(super) enum Holds {
     Json,
     Octets,
     Metrics,
+    /// Scripts, styles, programs.
+    Files,
 }
 
 /// What is told of a route.
@@ -80,6 +82,7 @@ impl Holds {
             Self::Json => "application/json",
             Self::Octets => "application/octet-stream",
             Self::Metrics => "application/openmetrics-text",
+            Self::Files => "*/*",
         }
     }
 }
@@ -122,7 +125,7 @@ fn operation(template: &str, about: &About) -> Operation {
     };
     let held = response(200, Some((about.holds.kind(), RefOr::T(schema.into()))));
     operation = operation.response("200", held);
-    if matches!(about.holds, Holds::Json | Holds::Octets) {
+    if matches!(about.holds, Holds::Json | Holds::Octets | Holds::Html | Holds::Files) {
         operation = operation.response("304", response(304, None));
         operation = operation.response("412", response(412, Some(problem())));
     }

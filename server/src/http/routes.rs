@@ -7,6 +7,7 @@ use super::contract::{self, About, Form, Holds};
 use super::many::{self, Batch};
 use super::metrics::{Route, metrics};
 use super::scenes::Found;
+use super::viewer;
 use crate::height::{self, HeightError};
 use crate::store::{Key, Kind, Store, zones};
 use crate::stream::Stream;
@@ -73,7 +74,16 @@ fn lines() -> Vec<Line> {
     let page = below("A page of the index, zstd-compressed", &[404, 410, 500]);
     let diamond = below("One diamond, named by its centre", &[404, 410, 500]);
     vec![
-        ("/", about("What there is, for people", Holds::Html), get(front_page)),
+        (
+            "/",
+            about("The viewer, for browsers; where it is not built, what there is, for people", Holds::Html),
+            get(front_page),
+        ),
+        (
+            "/web/{hash}/{file}",
+            About { refusals: &[404], ..about("A file of the viewer", Holds::Files) },
+            get(viewer_file),
+        ),
         ("/health", about("Whether the server answers", Holds::Text), well()),
         ("/ready", about("Whether it will go on", Holds::Text), get(ready)),
         ("/metrics", about("What was counted", Holds::Metrics), get(metrics)),
@@ -141,21 +151,36 @@ async fn ready(State(site): State<Arc<Site>>) -> Response {
     ([(header::CACHE_CONTROL, "no-store")], text).into_response()
 }
 
-async fn front_page(State(site): State<Arc<Site>>, caller: Caller) -> Html<String> {
+async fn front_page(State(site): State<Arc<Site>>, caller: Caller, headers: HeaderMap) -> Response {
+    if let Some(viewer) = &site.viewer {
+        return viewer.page(&headers);
+    }
     let mut page = String::from(
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content=\"width=device-width\"><title>Diamantina</title>\
          <style>body{font:16px/1.5 system-ui;max-width:44rem;margin:3rem auto;padding:0 1rem}code{background:#eee;padding:.1em .3em}</style>\
-         <h1>Diamantina</h1><p>This server streams terrain. Open a scene with the client:</p><ul>",
+         <h1>Diamantina</h1><p>This server streams terrain. The viewer for browsers is not built here: <code>make web</code> builds \
+         it, and says what it needs; then start the server again. Or open a scene with the client:</p><ul>",
     );
     for store in site.visible(caller) {
         let name = &store.scene().name;
         // Names are letters, digits, '-', '_' and '.': nothing to escape.
         page += &format!(
-            "<li><a href=/scenes/{name}>{name}</a> <code>diamantina-client render http://THIS-SERVER/scenes/{name} -o {name}.png</code>"
+            "<li><a href=/scenes/{name}>{name}</a> <code>diamantina-client view http://THIS-SERVER/scenes/{name}</code>"
         );
     }
     page += "</ul><p><a href=/scenes>All scenes as JSON</a></html>";
-    Html(page)
+    Html(page).into_response()
+}
+
+async fn viewer_file(
+    State(site): State<Arc<Site>>,
+    Path((hash, file)): Path<(String, String)>,
+    headers: HeaderMap,
+) -> Response {
+    match &site.viewer {
+        Some(viewer) => viewer.file(&headers, &hash, &file),
+        None => viewer::none().into_response(),
+    }
 }
 
 async fn catalogue(State(site): State<Arc<Site>>, caller: Caller, headers: HeaderMap) -> Response {

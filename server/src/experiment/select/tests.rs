@@ -183,7 +183,7 @@ fn a_mask_costs_no_triangles_even_where_it_counts_nothing() {
     for hidden in [0.0, 0.001, 0.05] {
         // A quarter is seen, in strips.
         let mask: Vec<f32> =
-            (0..SIDE * SIDE).map(|s| if s % SIDE / 4 % 4 == 0 { 1.0 } else { hidden }).collect();
+            (0..SIDE * SIDE).map(|s| if (s % SIDE / 4).is_multiple_of(4) { 1.0 } else { hidden }).collect();
         let [plain, masked] = [None, Some(&mask[..])].map(|w| Ground::new(&field, w).unwrap());
         for percent in [0.5, 1.0, 2.0, 5.0, 10.0] {
             let tolerance = percent / 100.0 * field.relief();

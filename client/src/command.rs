@@ -1,0 +1,575 @@
+//! The command line of the client.
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use diamantina_client::camera::{Camera, FOV_Y};
+use diamantina_client::doctor::{self, Verdict};
+use diamantina_client::encoding::Encoding;
+use diamantina_client::fetch::{self, FetchError};
+use diamantina_client::headless::{self, Flight, FlightPath, FrameLine, PictureReport};
+use diamantina_client::morph;
+use diamantina_client::render::{self, Background, Colours, Look, Sun};
+use diamantina_client::sight::Sight;
+use diamantina_client::terrain::{self, Terrain, TerrainError};
+use diamantina_client::viewer::{self, Viewer};
+use diamantina_protocol::message::Scene;
+use glam::DVec3;
+use std::io::{IsTerminal, Write};
+use std::ops::RangeInclusive;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::Duration;
+
+/// What heights may be multiplied by.
+const EXAGGERATION: RangeInclusive<f64> = 0.01..=1000.0;
+
+/// Seconds that points move in a window.
+const MORPH_SECONDS: f64 = 0.3;
+
+/// Draws streamed terrain.
+#[derive(Parser)]
+#[command(version, about, propagate_version = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Draw a picture once it is as exact as asked
+    Render(RenderArgs),
+    /// Fly along a path while data stream in
+    Fly(FlyArgs),
+    /// Look around in a window
+    View(ViewerArgs),
+    /// Tell what is wrong with a server, as clients see it through all the proxies and caches before it
+    Doctor(DoctorArgs),
+}
+
+/// What a private scene asks for.
+#[derive(Args, Clone)]
+struct TokenArgs {
+    /// Show this to the server, for private scenes. Others of this machine can read arguments: rather set the variable
+    #[arg(long, env = "DIAMANTINA_TOKEN", hide_env_values = true, value_name = "TOKEN")]
+    token: Option<String>,
+}
+
+#[derive(Args)]
+struct DoctorArgs {
+    /// The server, or one of its scenes: http://HOST:PORT or http://HOST:PORT/scenes/NAME
+    url: String,
+    #[command(flatten)]
+    token: TokenArgs,
+    /// Write what was found here, one JSON object a line (- for standard output)
+    #[arg(long, value_name = "JSON")]
+    json: Option<PathBuf>,
+}
+
+#[derive(Args)]
+struct ViewerArgs {
+    #[command(flatten)]
+    view: ViewArgs,
+    /// Seconds that points take to move where the level of detail changes [default: 0.3, and 0 for tin]
+    #[arg(long, value_name = "SECONDS")]
+    morph: Option<f64>,
+}
+
+#[derive(Args, Clone)]
+struct ViewArgs {
+    /// The server, or one of its scenes: http://HOST:PORT or http://HOST:PORT/scenes/NAME, or as a browser has it,
+    /// http://HOST:PORT/?scene=NAME; for `view` also with #x,y,z,heading,pitch
+    url: String,
+    #[command(flatten)]
+    token: TokenArgs,
+    /// Width and height of the picture, in pixels
+    #[arg(long, default_value = "1380x768", value_name = "WIDTHxHEIGHT", value_parser = parse_size)]
+    size: [u32; 2],
+    /// The largest error on the screen, in pixels
+    #[arg(long, default_value_t = 1.0, value_name = "PIXELS")]
+    error_pixels: f64,
+    /// Take an error for a sphere of its size, which looks the same from all sides. Without it errors of heights
+    /// count for less seen from above, where they hardly show
+    #[arg(long)]
+    sphere_error: bool,
+    /// How many times as large as in the middle of the picture an error may look at its corners; 1: the same
+    /// everywhere
+    #[arg(long, default_value_t = 1.0, value_name = "TIMES")]
+    foveation: f64,
+    /// How diamonds are encoded: points take the fewest bytes, tin draws the fewest triangles
+    #[arg(long, default_value = "points", value_enum)]
+    encoding: EncodingName,
+    /// Ask for less where nothing is seen from this zone, while the eye is in it: errors in pixels, those reported
+    /// too, then count for what is seen of them
+    #[arg(long, value_name = "NAME")]
+    zone: Option<String>,
+    /// Memory for decoded diamonds
+    #[arg(long, default_value = "1024", value_name = "MIB")]
+    memory: usize,
+    /// Where the sun stands: degrees clockwise from north, degrees above the horizon [default: 315,45; 315,20
+    /// on other bodies than the Earth]
+    #[arg(long, value_name = "AZIMUTH,ALTITUDE", value_parser = parse_pair)]
+    sun: Option<[f64; 2]>,
+    /// What is behind the terrain: sky, or a colour as six hexadecimal digits [default: sky; black on other
+    /// bodies than the Earth]
+    #[arg(long, value_name = "sky|RRGGBB", value_parser = parse_background)]
+    background: Option<Background>,
+    /// What colours mean: terrain is coloured by height, bathymetry also by depth below 0 m; auto is grey on
+    /// other bodies than the Earth, and bathymetry where a tenth of the range of heights lies below 0 m
+    #[arg(long, default_value = "auto", value_enum)]
+    colours: ColourName,
+    /// What heights are multiplied by, to make gentle relief visible; errors and the heights of eye and
+    /// target are multiplied, too
+    #[arg(long, default_value_t = 1.0, value_name = "N")]
+    exaggeration: f64,
+    /// Tint diamonds by their level
+    #[arg(long)]
+    show_levels: bool,
+    /// Draw the sides of triangles
+    #[arg(long)]
+    wireframe: bool,
+    /// One sample a pixel: faster, with jagged edges
+    #[arg(long)]
+    no_antialias: bool,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum ColourName {
+    Auto,
+    Terrain,
+    Bathymetry,
+    Grey,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum EncodingName {
+    Points,
+    Tin,
+}
+
+#[derive(Args)]
+struct RenderArgs {
+    #[command(flatten)]
+    view: ViewArgs,
+    /// The picture to write (PNG)
+    #[arg(short, long, value_name = "PNG")]
+    output: PathBuf,
+    /// The eye, in the frame's metres [default: where the whole scene is seen]
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, requires = "target", allow_hyphen_values = true)]
+    eye: Option<DVec3>,
+    /// A point in the middle of the picture, in the frame's metres
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, requires = "eye", allow_hyphen_values = true)]
+    target: Option<DVec3>,
+    /// Ask for the whole view in one request, the largest errors first: one round trip after the scene's
+    /// description. Without --eye it is asked for as seen from a little farther away than it is then drawn, and
+    /// more requests follow
+    #[arg(long, conflicts_with = "zone")]
+    stream: bool,
+    /// Seconds to wait for data before drawing what is there
+    #[arg(long, default_value_t = 60.0, value_name = "SECONDS")]
+    timeout: f64,
+    /// Write numbers about the picture here (- for standard output)
+    #[arg(long, value_name = "JSON")]
+    json: Option<PathBuf>,
+}
+
+#[derive(Args)]
+struct FlyArgs {
+    #[command(flatten)]
+    view: ViewArgs,
+    /// The path, as {"keys": [{"seconds": 0, "eye": [x,y,z], "target": [x,y,z]}, ...]} [default: a round over the scene]
+    #[arg(long, value_name = "JSON")]
+    path: Option<PathBuf>,
+    /// Frames to draw, spread evenly over the path
+    #[arg(long, default_value_t = 300, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    frames: u32,
+    /// Frames a second at most; 0: as fast as they can be drawn
+    #[arg(long, default_value_t = 30.0, value_name = "N")]
+    fps: f64,
+    /// Let each frame wait for its data, up to so many seconds: what a flight takes then follows from its path
+    /// alone, and flights can be compared
+    #[arg(long, value_name = "SECONDS")]
+    settle: Option<f64>,
+    /// Seconds of the path that the surface takes to move whenever its level of detail changes, up to 60; 0: it jumps
+    #[arg(long, default_value_t = 0.0, value_name = "SECONDS")]
+    morph: f64,
+    /// Write a line for each frame here (- for standard output)
+    #[arg(long, value_name = "CSV")]
+    csv: Option<PathBuf>,
+    /// Write each frame as a PNG into this folder
+    #[arg(long, value_name = "FOLDER")]
+    pictures: Option<PathBuf>,
+}
+
+fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
+    let parts: Vec<f64> = text
+        .split(',')
+        .map(|p| p.trim().parse().map_err(|_| format!("'{p}' is not a number")))
+        .collect::<Result<_, _>>()?;
+    let found = parts.len();
+    let numbers: [f64; N] =
+        parts.try_into().map_err(|_| format!("expected {N} numbers with commas between, found {found}"))?;
+    if numbers.iter().all(|n| n.is_finite()) {
+        Ok(numbers)
+    } else {
+        Err("expected finite numbers".to_owned())
+    }
+}
+
+fn parse_point(text: &str) -> Result<DVec3, String> {
+    numbers(text).map(DVec3::from_array)
+}
+
+fn parse_pair(text: &str) -> Result<[f64; 2], String> {
+    numbers(text)
+}
+
+fn parse_size(text: &str) -> Result<[u32; 2], String> {
+    let pair = text.split_once('x').and_then(|(w, h)| Some([w.parse().ok()?, h.parse().ok()?]));
+    pair.filter(|[w, h]: &[u32; 2]| *w > 0 && *h > 0)
+        .ok_or_else(|| "expected WIDTHxHEIGHT in pixels, as in 1380x768".to_owned())
+}
+
+fn parse_background(text: &str) -> Result<Background, String> {
+    if text == "sky" {
+        return Ok(Background::Sky);
+    }
+    let digits = text.strip_prefix('#').unwrap_or(text);
+    let colour = (digits.len() == 6).then(|| u32::from_str_radix(digits, 16).ok()).flatten();
+    let colour = colour.ok_or("expected sky or six hexadecimal digits, as in ff00ff")?;
+    // The picture is sRGB, blending is linear.
+    #[allow(clippy::cast_possible_truncation, reason = "a colour needs no more than f32")]
+    let linear = |shift: u32| {
+        let c = f64::from(colour >> shift & 0xff) / 255.0;
+        (if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }) as f32
+    };
+    Ok(Background::Colour([linear(16), linear(8), linear(0), 1.0]))
+}
+
+/// A failure with its exit code: 1 failed, 2 wrong use.
+struct Failure(u8, String);
+
+impl<E: std::error::Error> From<E> for Failure {
+    fn from(error: E) -> Self {
+        Self(1, error.to_string())
+    }
+}
+
+/// What became of printing results. That nobody reads any more, as behind `| head`, is no failure.
+fn shown(printed: std::io::Result<()>) -> std::io::Result<()> {
+    match printed {
+        Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        other => other,
+    }
+}
+
+pub(crate) fn run() -> ExitCode {
+    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
+        .unwrap_or_else(|_| "warn,wgpu_hal=error,wgpu_core=error".into());
+    let colours =
+        std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty());
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours);
+    log.with_writer(std::io::stderr).init();
+    let result = match Cli::parse().command {
+        Command::Render(args) => render(&args),
+        Command::Fly(args) => fly(&args),
+        Command::View(args) => view(&args),
+        Command::Doctor(args) => doctor(&args),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(Failure(code, message)) => {
+            // Nothing is left to do if standard error is closed.
+            let _ = writeln!(std::io::stderr(), "error: {message}");
+            ExitCode::from(code)
+        }
+    }
+}
+
+impl ViewArgs {
+    fn open(&self, morph_seconds: f64) -> Result<Terrain, Failure> {
+        if !(self.error_pixels.is_finite() && self.error_pixels > 0.0) {
+            return Err(Failure(
+                2,
+                format!("--error-pixels {}: expected a number above 0", self.error_pixels),
+            ));
+        }
+        if !EXAGGERATION.contains(&self.exaggeration) {
+            let [low, high] = [EXAGGERATION.start(), EXAGGERATION.end()];
+            return Err(Failure(
+                2,
+                format!("--exaggeration {}: expected a number from {low} to {high}", self.exaggeration),
+            ));
+        }
+        if !(self.foveation.is_finite() && self.foveation >= 1.0) {
+            return Err(Failure(2, format!("--foveation {}: expected a number from 1 on", self.foveation)));
+        }
+        let encoding = match self.encoding {
+            EncodingName::Points => Encoding::Points,
+            EncodingName::Tin => Encoding::Tin,
+        };
+        let options = terrain::Options {
+            tolerance_pixels: self.error_pixels,
+            memory_bytes: self.memory << 20,
+            sight: Sight { vertical: !self.sphere_error, foveation: self.foveation },
+            morph_seconds,
+            fetch: fetch::Options {
+                encoding,
+                token: self.token.token.as_deref().map(Into::into),
+                ..fetch::Options::default()
+            },
+            zone: self.zone.clone(),
+            ..terrain::Options::default()
+        };
+        Terrain::open(&self.url, options).map_err(|error| {
+            let wrong_use = matches!(
+                error,
+                TerrainError::Fetch(FetchError::Address { .. })
+                    | TerrainError::Zone { .. }
+                    | TerrainError::Still
+            );
+            Failure(if wrong_use { 2 } else { 1 }, error.to_string())
+        })
+    }
+
+    fn look(&self, scene: &Scene) -> Look {
+        let look = Look::of(scene);
+        Look {
+            background: self.background.unwrap_or(look.background),
+            sun: self.sun.map_or(look.sun, |[azimuth_degrees, altitude_degrees]| Sun {
+                azimuth_degrees,
+                altitude_degrees,
+            }),
+            colours: match self.colours {
+                ColourName::Auto => look.colours,
+                ColourName::Terrain => Colours::Terrain,
+                ColourName::Bathymetry => Colours::Bathymetry,
+                ColourName::Grey => Colours::Grey,
+            },
+            exaggeration: self.exaggeration,
+            show_levels: self.show_levels,
+            wireframe: self.wireframe,
+            ..look
+        }
+    }
+
+    fn options(&self) -> render::Options {
+        render::Options { samples: if self.no_antialias { 1 } else { 4 }, ..render::Options::default() }
+    }
+}
+
+fn render(args: &RenderArgs) -> Result<(), Failure> {
+    let patience = Duration::try_from_secs_f64(args.timeout)
+        .map_err(|_| Failure(2, format!("--timeout {}: expected seconds, 0 or more", args.timeout)))?;
+    if args.stream && matches!(args.view.encoding, EncodingName::Tin) {
+        return Err(Failure(2, "streams are of points: leave --stream or --encoding tin out".to_owned()));
+    }
+    let mut terrain = args.view.open(0.0)?;
+    let ViewArgs { size, exaggeration, .. } = args.view;
+    let camera = match (args.eye, args.target) {
+        (Some(eye), Some(target)) if eye == target => {
+            return Err(Failure(
+                2,
+                "--eye and --target are the same point: there is no direction to look in".to_owned(),
+            ));
+        }
+        (Some(eye), Some(target)) => {
+            let camera = Camera { eye, target, fov_y: FOV_Y, size };
+            if args.stream {
+                headless::stream(&mut terrain, &camera, exaggeration);
+            }
+            camera
+        }
+        _ => {
+            if args.stream {
+                let wide = headless::stretched_overview(terrain.scene(), size, exaggeration);
+                headless::stream(&mut terrain, &wide, exaggeration);
+            }
+            headless::framed(&mut terrain, size, exaggeration, patience)
+        }
+    };
+    let look = args.view.look(terrain.scene());
+    let (picture, report) = headless::picture(&mut terrain, &camera, &look, &args.view.options(), patience)?;
+    headless::save(&picture, &args.output)?;
+    if let Some(path) = &args.json {
+        let mut out = headless::open_text(path)?;
+        let printed = writeln!(out, "{}", serde_json::to_string_pretty(&report)?);
+        shown(printed.and_then(|()| out.flush()))?;
+    }
+    if args.json.as_ref().is_none_or(|p| p.as_os_str() != "-") {
+        shown(print_report(args, &report))?;
+    }
+    if report.complete {
+        return Ok(());
+    }
+    let why = terrain.problem().unwrap_or("the data did not arrive in time; wait longer with --timeout");
+    Err(Failure(
+        1,
+        format!(
+            "{}: written, but its largest error is {:.2} pixels: {why}",
+            args.output.display(),
+            report.largest_error_pixels
+        ),
+    ))
+}
+
+fn print_report(args: &RenderArgs, r: &PictureReport) -> std::io::Result<()> {
+    let mut out = std::io::stdout().lock();
+    writeln!(
+        out,
+        "{}: {} x {} pixels, largest error {:.2} pixels",
+        args.output.display(),
+        r.size[0],
+        r.size[1],
+        r.largest_error_pixels
+    )?;
+    writeln!(
+        out,
+        "  {} bytes in {} requests and {} round trips; {} real points, {} fictitious",
+        r.bytes, r.requests, r.round_trips, r.real_points, r.fictitious_points
+    )?;
+    writeln!(
+        out,
+        "  {} triangles in {} draws, {:.0} ms a frame",
+        r.triangles_drawn, r.draws, r.milliseconds_a_frame
+    )
+}
+
+fn view(args: &ViewerArgs) -> Result<(), Failure> {
+    let morph = args.morph.unwrap_or(match args.view.encoding {
+        EncodingName::Points => MORPH_SECONDS,
+        EncodingName::Tin => 0.0,
+    });
+    if !(0.0..=morph::SECONDS_MAX).contains(&morph) {
+        let max = morph::SECONDS_MAX;
+        return Err(Failure(2, format!("--morph {morph}: expected seconds from 0 to {max}")));
+    }
+    let (url, at) = match args.view.url.split_once('#') {
+        Some((url, view)) => {
+            let expected = "expected #x,y,z,heading,pitch, metres and degrees, as `Copy view` gives it";
+            let camera = viewer::camera_at(view, args.view.size);
+            (url.to_owned(), Some(camera.ok_or_else(|| Failure(2, format!("#{view}: {expected}")))?))
+        }
+        None => (args.view.url.clone(), None),
+    };
+    let view = ViewArgs { url: url.clone(), ..args.view.clone() };
+    let terrain = view.open(morph)?;
+    let look = view.look(terrain.scene());
+    let title = format!("{} - Diamantina", terrain.scene().name);
+    let viewer = Viewer::new(terrain, &url, look, view.size, at);
+    viewer::window::run(viewer, &title, &view.options()).map_err(|e| Failure(1, e.to_string()))
+}
+
+fn doctor(args: &DoctorArgs) -> Result<(), Failure> {
+    let mut json = args.json.as_deref().map(headless::open_text).transpose()?;
+    let is_quiet = args.json.as_ref().is_some_and(|path| path.as_os_str() == "-");
+    let (mut counts, mut failed) = ([0u32; 3], None);
+    let told = doctor::examine(&args.url, args.token.token.as_deref(), |finding| {
+        counts[finding.verdict as usize] += 1;
+        let mut write = || -> std::io::Result<()> {
+            if let Some(out) = &mut json {
+                writeln!(out, "{}", serde_json::to_string(&finding)?)?;
+            }
+            if !is_quiet {
+                let mut out = std::io::stdout().lock();
+                writeln!(out, "{:8} {:18} {}", finding.verdict, finding.check, finding.found)?;
+                if let Some(remedy) = finding.remedy {
+                    writeln!(out, "{:27} {remedy}", "")?;
+                }
+            }
+            Ok(())
+        };
+        if let Err(error) = write() {
+            failed.get_or_insert(error);
+        }
+    });
+    told.map_err(|e| Failure(if matches!(e, FetchError::Address { .. }) { 2 } else { 1 }, e.to_string()))?;
+    if let Some(out) = &mut json {
+        shown(out.flush())?;
+    }
+    if let Some(error) = failed {
+        shown(Err(error))?;
+    }
+    match counts[Verdict::Bad as usize] {
+        0 => Ok(()),
+        1 => Err(Failure(1, "one thing does not work".to_owned())),
+        n => Err(Failure(1, format!("{n} things do not work"))),
+    }
+}
+
+fn fly(args: &FlyArgs) -> Result<(), Failure> {
+    if !(args.fps.is_finite() && args.fps >= 0.0) {
+        return Err(Failure(2, format!("--fps {}: expected 0 or more", args.fps)));
+    }
+    let patience = args.settle.map(Duration::try_from_secs_f64).transpose();
+    let patience = patience.map_err(|_| {
+        let found = args.settle.unwrap_or_default();
+        Failure(2, format!("--settle {found}: expected seconds, 0 or more"))
+    })?;
+    if !(0.0..=morph::SECONDS_MAX).contains(&args.morph) {
+        let max = morph::SECONDS_MAX;
+        return Err(Failure(2, format!("--morph {}: expected seconds from 0 to {max}", args.morph)));
+    }
+    let path = args.path.as_deref().map(FlightPath::read).transpose()?;
+    let mut terrain = args.view.open(args.morph)?;
+    let path = path.unwrap_or_else(|| FlightPath::round(terrain.scene()));
+    let mut csv = args.csv.as_deref().map(headless::open_text).transpose()?;
+    if let Some(out) = &mut csv {
+        writeln!(out, "{}", FrameLine::HEADING)?;
+    }
+    if let Some(folder) = &args.pictures {
+        std::fs::create_dir_all(folder).map_err(|e| {
+            Failure(
+                1,
+                format!(
+                    "{}: cannot create the folder: {e}; choose another with --pictures",
+                    folder.display()
+                ),
+            )
+        })?;
+    }
+    let flight = Flight {
+        frames: args.frames,
+        frames_a_second: args.fps,
+        size: args.view.size,
+        pictures: args.pictures.clone(),
+        patience,
+    };
+    let (mut slowest_cut, mut draw_sum, mut last) = (0.0f64, 0.0, None);
+    let mut failed = None;
+    let bar = indicatif::ProgressBar::new(args.frames.into());
+    let look = args.view.look(terrain.scene());
+    headless::fly(&mut terrain, &path, &flight, &look, &args.view.options(), |line, _| {
+        slowest_cut = slowest_cut.max(line.cut_ms);
+        draw_sum += line.draw_ms;
+        bar.inc(1);
+        if let Some(out) = &mut csv
+            && let Err(e) = writeln!(out, "{}", line.csv())
+        {
+            failed.get_or_insert(e);
+        }
+        last = Some(line.clone());
+        Ok(())
+    })?;
+    bar.finish_and_clear();
+    if let Some(out) = &mut csv {
+        out.flush()?;
+    }
+    if let Some(error) = failed {
+        return Ok(shown(Err(error))?);
+    }
+    if let Some(last) = last.filter(|_| args.csv.as_ref().is_none_or(|p| p.as_os_str() != "-")) {
+        let mut out = std::io::stdout().lock();
+        writeln!(
+            out,
+            "{} frames in {:.1} s: slowest cut {slowest_cut:.1} ms, mean draw {:.1} ms",
+            args.frames,
+            last.seconds,
+            draw_sum / f64::from(args.frames)
+        )?;
+        writeln!(
+            out,
+            "  {} bytes in {} requests and {} round trips; error at the end {:.2} pixels",
+            last.bytes, last.requests, last.round_trips, last.error_pixels
+        )?;
+    }
+    Ok(())
+}

@@ -1,0 +1,182 @@
+//! A window, or a canvas, and what draws the viewer on it.
+
+use super::Viewer;
+use crate::render::{self, RenderError, Renderer};
+use egui_wgpu::{RendererOptions, ScreenDescriptor};
+use std::sync::Arc;
+use std::time::Duration;
+use winit::dpi::PhysicalSize;
+use winit::event::WindowEvent;
+use winit::window::Window;
+
+/// Between frames while nothing happens: what arrives is drawn within it.
+pub(crate) const IDLE: Duration = Duration::from_millis(250);
+
+/// A window and what draws on it.
+pub(crate) struct Display {
+    window: Arc<Window>,
+    surface: wgpu::Surface<'static>,
+    configuration: wgpu::SurfaceConfiguration,
+    renderer: Renderer,
+    input: egui_winit::State,
+    painter: egui_wgpu::Renderer,
+    #[cfg(target_arch = "wasm32")]
+    backend: wgpu::Backend,
+}
+
+impl Display {
+    /// What draws on a window, by one of these kinds of graphics.
+    ///
+    /// # Errors
+    /// When there is no graphics adapter that draws on it.
+    pub(crate) async fn new(
+        window: Arc<Window>,
+        options: &render::Options,
+        backends: wgpu::Backends,
+    ) -> Result<Self, RenderError> {
+        let none = |e: &dyn std::fmt::Display| RenderError::NoAdapter(e.to_string());
+        let instance = render::instance(backends).await;
+        let surface = instance.create_surface(Arc::clone(&window)).map_err(|e| none(&e))?;
+        let (adapter, device, queue) = render::device(&instance, Some(&surface), "window").await?;
+        let limit = device.limits().max_texture_dimension_2d;
+        let found = window.inner_size();
+        let [width, height] = [found.width, found.height].map(|size| size.clamp(1, limit));
+        let mut configuration = surface
+            .get_default_config(&adapter, width, height)
+            .ok_or_else(|| none(&"none that draws on this screen"))?;
+        // The panel's colours are mixed as they are encoded; the terrain's shader encodes by itself.
+        let formats = surface.get_capabilities(&adapter).formats;
+        let plain = formats.iter().copied().find(|format| !format.is_srgb());
+        configuration.format = plain.unwrap_or(configuration.format);
+        surface.configure(&device, &configuration);
+        let painter = egui_wgpu::Renderer::new(&device, configuration.format, RendererOptions::default());
+        let context = egui::Context::default();
+        let (view, side) = (egui::ViewportId::ROOT, usize::try_from(limit).ok());
+        let input = egui_winit::State::new(context, view, &window, None, None, side);
+        let options = render::Options { format: configuration.format, ..*options };
+        let renderer = Renderer::new(device, queue, &options);
+        Ok(Self {
+            window,
+            surface,
+            configuration,
+            renderer,
+            input,
+            painter,
+            #[cfg(target_arch = "wasm32")]
+            backend: adapter.get_info().backend,
+        })
+    }
+
+    /// What draws.
+    #[cfg(target_arch = "wasm32")]
+    pub(crate) fn graphics(&self) -> &'static str {
+        match self.backend {
+            wgpu::Backend::BrowserWebGpu => "webgpu",
+            _ => "webgl",
+        }
+    }
+
+    /// Has `tell` know why the device is lost, should it be.
+    #[cfg(target_arch = "wasm32")]
+    pub(crate) fn on_loss(&self, tell: fn(&str)) {
+        self.renderer.device().set_device_lost_callback(move |_, why| tell(&why));
+    }
+
+    /// Asks for a frame.
+    pub(crate) fn request_redraw(&self) {
+        self.window.request_redraw();
+    }
+
+    /// Puts a text on the clipboard.
+    #[cfg(not(target_arch = "wasm32"))]
+    pub(crate) fn set_clipboard_text(&mut self, text: &str) {
+        self.input.set_clipboard_text(text.to_owned());
+    }
+
+    /// Takes in an event of the window.
+    pub(crate) fn take(&mut self, event: &WindowEvent) {
+        if let WindowEvent::Resized(size) = event {
+            self.resize(*size);
+        }
+        if self.input.on_window_event(&self.window, event).repaint {
+            self.window.request_redraw();
+        }
+    }
+
+    fn resize(&mut self, size: PhysicalSize<u32>) {
+        // A window may be without any extent for a while.
+        if size.width > 0 && size.height > 0 {
+            let limit = self.renderer.device().limits().max_texture_dimension_2d;
+            let [width, height] = [size.width, size.height].map(|size| size.min(limit));
+            (self.configuration.width, self.configuration.height) = (width, height);
+            self.surface.configure(self.renderer.device(), &self.configuration);
+        }
+    }
+
+    /// The texture to draw on; none if the window is hidden, or has changed and is set up anew.
+    fn texture(&mut self) -> Option<wgpu::SurfaceTexture> {
+        use wgpu::CurrentSurfaceTexture::{Lost, Outdated, Suboptimal, Success};
+        match self.surface.get_current_texture() {
+            Success(texture) | Suboptimal(texture) => Some(texture),
+            Lost | Outdated => {
+                self.surface.configure(self.renderer.device(), &self.configuration);
+                self.window.request_redraw();
+                None
+            }
+            _ => None,
+        }
+    }
+
+    /// Draws a frame, with the panel or without; how long until the next is wanted.
+    pub(crate) fn draw(&mut self, viewer: &mut Viewer, with_panel: bool) -> Duration {
+        viewer.resize([self.configuration.width, self.configuration.height]);
+        let input = self.input.take_egui_input(&self.window);
+        let context = self.input.egui_ctx().clone();
+        let mut output = context.run_ui(input, |ui| viewer.update(ui));
+        self.input.handle_platform_output(&self.window, output.platform_output);
+        let repaint = output.viewport_output.get(&egui::ViewportId::ROOT).map(|view| view.repaint_delay);
+        let shapes = context.tessellate(output.shapes, output.pixels_per_point);
+        for (id, changes) in output.textures_delta.set.drain() {
+            for change in &changes {
+                self.painter.update_texture(self.renderer.device(), self.renderer.queue(), id, change);
+            }
+        }
+        if let Some(texture) = self.texture() {
+            let view = texture.texture.create_view(&wgpu::TextureViewDescriptor::default());
+            let layers = &viewer.terrain().scene().layers;
+            let drawn = self.renderer.draw(layers, viewer.camera(), &viewer.items(), viewer.look(), &view);
+            if with_panel {
+                self.paint(&view, &shapes, output.pixels_per_point);
+            }
+            viewer.note(drawn);
+            self.window.pre_present_notify();
+            self.renderer.queue().present(texture);
+        }
+        for id in output.textures_delta.free.drain() {
+            self.painter.free_texture(&id);
+        }
+        repaint.unwrap_or(IDLE).min(IDLE)
+    }
+
+    /// Draws the panel over the terrain.
+    fn paint(&mut self, view: &wgpu::TextureView, shapes: &[egui::ClippedPrimitive], pixels_per_point: f32) {
+        let (device, queue) = (self.renderer.device(), self.renderer.queue());
+        let size_in_pixels = [self.configuration.width, self.configuration.height];
+        let screen = ScreenDescriptor { size_in_pixels, pixels_per_point };
+        let mut encoder = device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        let mut commands = self.painter.update_buffers(device, queue, &mut encoder, shapes, &screen);
+        let pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
+            label: Some("panel"),
+            color_attachments: &[Some(wgpu::RenderPassColorAttachment {
+                view,
+                depth_slice: None,
+                resolve_target: None,
+                ops: wgpu::Operations { load: wgpu::LoadOp::Load, store: wgpu::StoreOp::Store },
+            })],
+            ..Default::default()
+        });
+        self.painter.render(&mut pass.forget_lifetime(), shapes, &screen);
+        commands.push(encoder.finish());
+        queue.submit(commands);
+    }
+}

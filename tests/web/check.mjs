@@ -1,0 +1,189 @@
+// The viewer in a headless Chromium, as a person uses it, on WebGPU and on WebGL2. Whatever is drawn is judged by its
+// pixels: a page whose device is lost at the first frame goes on counting frames.
+//
+// node check.mjs PLAYWRIGHT CHROMIUM URL CLIENT FOLDER: the folder of playwright-core, the browser, the server of scenes
+// `hills` and `plain`, the client's program, and a folder for pictures.
+import { execFileSync } from 'node:child_process';
+import { readFileSync, writeFileSync } from 'node:fs';
+import { createRequire } from 'node:module';
+import { join } from 'node:path';
+
+const [playwright, executablePath, url, client, folder] = process.argv.slice(2);
+const { chromium } = createRequire(join(playwright, 'package.json'))('playwright-core');
+
+const SIZE = { width: 900, height: 600 };
+const ERROR_PIXELS = 2;
+// From the south-west, down into the hills.
+const VIEW = { eye: [2500, 500, 2600], heading: 25, pitch: 32 };
+const PATIENCE = 60_000;
+
+const COMMON = ['--no-sandbox', '--disable-quic', '--no-first-run', '--disable-background-networking',
+    '--disable-component-update', '--disable-sync', '--use-angle=swiftshader'];
+// With fewer of these, WebGPU draws nothing and says nothing.
+const FLAGS = {
+    webgpu: ['--enable-unsafe-webgpu', '--enable-features=Vulkan', '--use-vulkan=swiftshader'],
+    webgl: ['--enable-unsafe-swiftshader', '--disable-features=WebGPU'],
+};
+
+function check(is_so, what) {
+    if (!is_so) throw new Error(what);
+}
+
+const hash = ({ eye, heading, pitch }) => `#${[...eye, heading, pitch].join(',')}`;
+
+/// The same view by the client without a window.
+function headless(view, path) {
+    const [heading, pitch] = [view.heading, view.pitch].map((degrees) => degrees * Math.PI / 180);
+    const ahead = [Math.sin(heading) * Math.cos(pitch), Math.cos(heading) * Math.cos(pitch), -Math.sin(pitch)];
+    const target = view.eye.map((at, i) => at + 1000 * ahead[i]);
+    execFileSync(client, ['render', `${url}/scenes/hills`, '-o', path, '--size', `${SIZE.width}x${SIZE.height}`,
+        '--error-pixels', `${ERROR_PIXELS}`, '--eye', view.eye.join(','), '--target', target.join(',')]);
+    return readFileSync(path);
+}
+
+/// How far two pictures differ: the mean of all channels, and the share of pixels that differ by more than 32.
+async function compare(page, pictures) {
+    return page.evaluate(async (urls) => {
+        const [a, b] = await Promise.all(urls.map(async (url) => {
+            const image = new Image();
+            image.src = url;
+            await image.decode();
+            const canvas = new OffscreenCanvas(image.width, image.height);
+            const context = canvas.getContext('2d');
+            context.drawImage(image, 0, 0);
+            return context.getImageData(0, 0, image.width, image.height);
+        }));
+        if (a.width !== b.width || a.height !== b.height) return { mean: 255, off: 1, ground: 0 };
+        let [sum, off, ground] = [0, 0, 0];
+        for (let i = 0; i < a.data.length; i += 4) {
+            const by = [0, 1, 2].map((c) => Math.abs(a.data[i + c] - b.data[i + c]));
+            sum += by[0] + by[1] + by[2];
+            off += Math.max(...by) > 32;
+            ground += Math.max(a.data[i], a.data[i + 1]) > a.data[i + 2] + 8;
+        }
+        const pixels = a.data.length / 4;
+        return { mean: sum / pixels / 3, off: off / pixels, ground: ground / pixels };
+    }, pictures.map((bytes) => `data:image/png;base64,${bytes.toString('base64')}`));
+}
+
+const state = (page) => page.evaluate(() => window.diamantina?.state());
+
+/// Waits until all that is asked for is drawn and stands still.
+async function settled(page) {
+    const until = Date.now() + PATIENCE;
+    for (;;) {
+        const now = await state(page).catch(() => null);
+        if (now?.complete && now.moving === 0 && now.error_pixels <= ERROR_PIXELS) return now;
+        const said = await page.locator('#message').textContent();
+        check(Date.now() < until, `not settled: ${JSON.stringify(now)}; the page says: ${said}`);
+        await page.waitForTimeout(100);
+    }
+}
+
+/// A frame and more.
+async function frames(page, count) {
+    const { frames } = await state(page);
+    while ((await state(page)).frames < frames + count) await page.waitForTimeout(20);
+}
+
+async function heights(page, reference, blank, graphics) {
+    const query = `error=${ERROR_PIXELS}${graphics === 'webgl' ? '&graphics=webgl' : ''}`;
+    await page.goto(`${url}/?scene=hills&${query}${hash(VIEW)}`);
+    const first = await settled(page);
+    check(first.graphics === graphics, `drawn by ${first.graphics}, not ${graphics}`);
+    check(first.scene === 'hills', `the scene is ${first.scene}`);
+    await page.screenshot({ path: join(folder, `${graphics}-panel.png`) });
+
+    // Without the panel there is nothing but terrain and sky.
+    await page.keyboard.press('Tab');
+    await frames(page, 3);
+    const shot = await page.screenshot({ path: join(folder, `${graphics}.png`) });
+    const { mean, off, ground } = await compare(blank, [shot, reference]);
+    check(ground > 0.2, `ground on ${(100 * ground).toFixed(1)} % of the picture`);
+    check(mean < 2 && off < 0.01, `differs from the client's picture: ${mean.toFixed(2)} on average, ` +
+        `${(100 * off).toFixed(2)} % of the pixels by more than 32`);
+
+    // A click tells the height that the server tells.
+    await page.mouse.click(450, 400);
+    await frames(page, 3);
+    const { marks } = await state(page);
+    check(marks.length === 1, `${marks.length} places clicked`);
+    const [[x, y, z], error] = marks[0];
+    const answer = await fetch(`${url}/scenes/hills/terrain/height?x=${x}&y=${y}`);
+    const told = await answer.json();
+    // The triangles drawn may be off by their declared error, and so may the server's.
+    check(error !== null && error < 20, `declared to be off by ${error} m`);
+    const most = error + told.error + 0.01;
+    check(Math.abs(told.height - z) <= most, `clicked ${z} at ${x}, ${y}; the server says ${JSON.stringify(told)}`);
+
+    // The wheel goes nearer, and the address follows.
+    await page.mouse.move(450, 400);
+    for (let i = 0; i < 4; i++) await page.mouse.wheel(0, -120);
+    const nearer = await settled(page);
+    await page.waitForFunction(() => location.hash === `#${window.diamantina.state().view}`, null, { timeout: PATIENCE });
+    check(nearer.view !== first.view, 'the wheel does not move the eye');
+    const link = page.url();
+    check(link.includes('scene=hills') && link.includes(query), `the address is ${link}`);
+    const before = await page.screenshot();
+    check((await compare(blank, [before, shot])).off > 0.05, 'nothing moved on the picture');
+
+    // The address opens the same view again.
+    await page.goto('about:blank');
+    await page.goto(link);
+    await settled(page);
+    await page.keyboard.press('Tab');
+    await frames(page, 3);
+    const again = await compare(blank, [before, await page.screenshot()]);
+    // What was clicked is marked in the one and not in the other.
+    check(again.mean < 2 && again.off < 0.01, `the address opens another view: ${JSON.stringify(again)}`);
+
+    // Who changes the address is flown there.
+    await page.evaluate((there) => { location.hash = there; }, hash(VIEW));
+    await page.waitForFunction(() => window.diamantina.state().view.startsWith('2500.00,500.00,2600.00,25.000,32.000'),
+        null, { timeout: PATIENCE });
+
+    const last = await state(page);
+    return `${mean.toFixed(2)} from the client's picture, longest frame ${last.longest_frame_milliseconds.toFixed(0)} ms`;
+}
+
+/// A page that says what to choose from, if it is not told.
+async function choice(page) {
+    await page.goto(`${url}/`);
+    const links = page.locator('#message a');
+    await links.first().waitFor({ timeout: PATIENCE });
+    const names = await links.allTextContents();
+    check(names.join() === 'hills,plain', `to choose from: ${names}`);
+    await links.first().click();
+    await page.waitForFunction(() => window.diamantina?.state().frames > 0, null, { timeout: PATIENCE });
+    check((await state(page)).scene === 'hills', 'another scene was chosen');
+    await page.goto(`${url}/?scene=nowhere`);
+    await page.locator('#message.failed').waitFor({ timeout: PATIENCE });
+}
+
+const reference = headless(VIEW, join(folder, 'client.png'));
+for (const graphics of ['webgpu', 'webgl']) {
+    const began = Date.now();
+    const args = [...COMMON, ...FLAGS[graphics]];
+    const browser = await chromium.launch({ executablePath, headless: true, args });
+    try {
+        const context = await browser.newContext({ viewport: SIZE, deviceScaleFactor: 1 });
+        const [page, blank] = [await context.newPage(), await context.newPage()];
+        const wrong = [];
+        let allowed = null;
+        page.on('console', (line) => line.type() === 'error' && !allowed?.test(line.text()) && wrong.push(line.text()));
+        page.on('pageerror', (error) => wrong.push(`${error}`));
+        page.on('response', (answer) => answer.status() >= 400 && !allowed && wrong.push(`${answer.status()} ${answer.url()}`));
+        const what = await heights(page, reference, blank, graphics).catch(async (error) => {
+            await page.screenshot({ path: join(folder, `${graphics}-failed.png`) }).catch(() => {});
+            throw new Error(`${graphics}: ${error.message}; errors: ${wrong.join(' | ') || 'none'}`);
+        });
+        // Of a scene that is not there the browser says so by itself.
+        allowed = /404/;
+        if (graphics === 'webgpu') await choice(page);
+        check(wrong.length === 0, `${graphics}: the console says ${wrong.join(' | ')}`);
+        console.log(`${graphics}: ${what}, ${((Date.now() - began) / 1000).toFixed(1)} s`);
+    } finally {
+        await browser.close();
+    }
+}
+writeFileSync(join(folder, 'done'), '');
