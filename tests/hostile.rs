@@ -355,7 +355,7 @@ fn what_is_no_store_is_refused() {
             ("nowhere", ["nowhere", "not a store", "diamantina-server build"]),
             ("dem.tif", ["dem.tif", "not a store", "diamantina-server build"]),
             ("newer", ["newer", newer_format.as_str(), "build it again"]),
-            ("text", ["text", "not JSON", "build the store again"]),
+            ("text", ["text", "not JSON", "repair"]),
             ("alone", ["alone", "directory", "cannot read"]),
         ] {
             let ended = server(folder, &format!("{command} {{}}/{store}"));

@@ -662,7 +662,7 @@ fn a_picture_from_a_stream_is_the_same_picture_in_one_round_trip() {
 #[test]
 fn a_stream_cut_off_anywhere_is_completed_by_ordinary_requests() {
     let world = World::sample(1025, 0.0);
-    // The client's first connection brings the description, then the stream.
+    // One connection brings the description and then the stream, if it is free again by then; else another one the stream.
     for first_cut_at in [9_000, 15_000, 30_000, 60_000] {
         let faults = Faults { first_cut_at: Some(first_cut_at), ..Faults::default() };
         let proxy = Proxy::start(&world.served.address, faults, 1);

@@ -59,6 +59,15 @@ pub(crate) fn programs() -> &'static Programs {
         cargo.current_dir(workspace()).args(["build", "--workspace", "--bins", "--tests"]);
         cargo.arg("--message-format=json-render-diagnostics");
         cargo.args(["--profile", if profile == "debug" { "dev" } else { profile }]);
+        // What cargo told this test about its own package is not for the build: dependencies that look at it would be
+        // built again, and all that needs them.
+        let told = |name: &std::ffi::OsStr| {
+            let name = name.to_string_lossy();
+            name.starts_with("CARGO_PKG_")
+                || name.starts_with("CARGO_MANIFEST_")
+                || name == "CARGO_CRATE_NAME"
+        };
+        std::env::vars_os().filter(|(name, _)| told(name)).for_each(|(name, _)| drop(cargo.env_remove(name)));
         let output = cargo.stderr(Stdio::inherit()).output().unwrap();
         assert!(output.status.success(), "the programs do not build");
         let messages: Vec<serde_json::Value> = output
@@ -246,7 +255,7 @@ pub(crate) struct Faults {
     pub(crate) delay: Duration,
     /// How likely a connection is to be cut at some random byte.
     pub(crate) cut: f64,
-    /// Where the first connection is cut, which is left alone otherwise.
+    /// The connection that is the first to carry more bytes than this is cut there, and no other.
     pub(crate) first_cut_at: Option<u64>,
     /// How likely a connection is to fall silent for `stall` at some random byte.
     pub(crate) stalled: f64,
@@ -264,7 +273,7 @@ pub(crate) struct Proxy {
 
 impl Proxy {
     /// Starts a proxy, whose threads end with the process. The first connection, which reads the scene's
-    /// description, is left alone unless it is said where to cut it.
+    /// description, is left alone but for that.
     pub(crate) fn start(upstream: &str, faults: Faults, seed: u64) -> Self {
         let upstream = upstream.strip_prefix("http://").unwrap().to_owned();
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -299,7 +308,6 @@ fn pump(
 ) {
     // Where in the connection's life something happens to it.
     let cut_at = (spoil && dice.roll() < faults.cut).then(|| dice.below(60_000));
-    let cut_at = if spoil { cut_at } else { faults.first_cut_at };
     let stall_at = (spoil && dice.roll() < faults.stalled).then(|| dice.below(60_000));
     let delay = faults.delay.mul_f64(dice.roll());
     let (mut sent, mut stalled) = (0, false);
@@ -312,8 +320,12 @@ fn pump(
             done.fetch_add(1, Ordering::Relaxed);
             std::thread::sleep(faults.stall);
         }
-        if cut_at.is_some_and(|at| sent > at) {
+        let is_first = faults.first_cut_at.is_some_and(|at| sent > at)
+            && done.compare_exchange(0, 1, Ordering::Relaxed, Ordering::Relaxed).is_ok();
+        if !is_first && cut_at.is_some_and(|at| sent > at) {
             done.fetch_add(1, Ordering::Relaxed);
+        }
+        if is_first || cut_at.is_some_and(|at| sent > at) {
             let _ = to.write_all(&buffer[..count / 2]);
             break;
         }
