@@ -67,7 +67,9 @@ pub(crate) fn programs() -> &'static Programs {
                 || name.starts_with("CARGO_MANIFEST_")
                 || name == "CARGO_CRATE_NAME"
         };
-        std::env::vars_os().filter(|(name, _)| told(name)).for_each(|(name, _)| drop(cargo.env_remove(name)));
+        for (name, _) in std::env::vars_os().filter(|(name, _)| told(name)) {
+            cargo.env_remove(name);
+        }
         let output = cargo.stderr(Stdio::inherit()).output().unwrap();
         assert!(output.status.success(), "the programs do not build");
         let messages: Vec<serde_json::Value> = output
