@@ -335,7 +335,11 @@ fn check_real(of_large: &[(f64, Rule)], of_others: &[(f64, Rule)]) {
     for (dem, ingest) in dems(&folder) {
         let source = ingest::open(std::slice::from_ref(&dem), &ingest).unwrap();
         let is_large = u64::from(source.grid().width) * u64::from(source.grid().height) >= LARGE;
-        check_all(&dem, &ingest, if is_large { of_large } else { of_others });
+        let cases = if is_large { of_large } else { of_others };
+        if cases.is_empty() {
+            continue;
+        }
+        check_all(&dem, &ingest, cases);
         seen += 1;
     }
     let _ = writeln!(std::io::stderr(), "law 3: {seen} DEMs as they are");
@@ -348,7 +352,7 @@ fn every_sample_of_every_real_dem_is_within_the_declared_error_at_every_level() 
 }
 
 #[test]
-#[ignore = "minutes: make test-long"]
+#[ignore = "builds and compares the largest DEMs four times more: too long for each change; `make test-long` runs it"]
 fn every_sample_of_the_largest_dems_is_within_the_declared_error_with_the_other_options() {
     check_real(&[CASES[1], CASES[2], CASES[4], CASES[5]], &[]);
 }
