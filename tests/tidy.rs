@@ -37,6 +37,8 @@ const SERVER: &[(&str, &[&str])] = &[
     ("size", &[]),
     ("http", &["height", "inspect", "size", "store", "stream"]),
     ("settings", &["http", "size"]),
+    // What the program prints.
+    ("print", &[]),
     ("sample", &[]),
     ("client_program", &[]),
     ("demo", &["client_program", "hierarchy", "http", "ingest", "progress", "sample"]),

@@ -1,12 +1,14 @@
 //! The command line of the server.
 
+mod print;
+
 use clap::{ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
-use diamantina_protocol::message::{Kind, Layer, is_name};
+use diamantina_protocol::message::{Kind, is_name};
 use diamantina_protocol::points::Rule;
 use diamantina_server::experiment::ExperimentError;
-use diamantina_server::hierarchy::{self, BuildError, Estimate, Report, TinOptions};
+use diamantina_server::hierarchy::{self, BuildError, TinOptions};
 use diamantina_server::ingest::IngestError;
-use diamantina_server::inspect::{self, Inspection, TinInspection};
+use diamantina_server::inspect;
 use diamantina_server::progress::Progress;
 use diamantina_server::settings::{self, LogFormat, Merged, Settings};
 use diamantina_server::size::parse_bytes;
@@ -450,7 +452,7 @@ fn build(args: &BuildArgs) -> Result<(), Failure> {
         if args.json {
             writeln!(out, "{}", serde_json::to_string_pretty(&estimate)?)?;
         } else {
-            print_estimate(&mut out, &args.output, &estimate)?;
+            print::estimate(&mut out, &args.output, &estimate)?;
         }
         return Ok(());
     }
@@ -484,7 +486,7 @@ fn build(args: &BuildArgs) -> Result<(), Failure> {
     if args.json {
         shown(writeln!(out, "{}", serde_json::to_string_pretty(&report)?))?;
     } else {
-        shown(print_report(&mut out, &args.output, &report))?;
+        shown(print::report(&mut out, &args.output, &report))?;
     }
     Ok(())
 }
@@ -604,72 +606,6 @@ fn refuse_build(sources: &[PathBuf], error: &BuildError) -> Failure {
         _ => 1,
     };
     Failure(code, format!("{from}{error}"))
-}
-
-fn print_estimate(out: &mut impl Write, store: &Path, e: &Estimate) -> std::io::Result<()> {
-    writeln!(
-        out,
-        "{}: estimated from {} of {} samples; nothing was written",
-        store.display(),
-        e.sampled,
-        e.samples
-    )?;
-    writeln!(out, "  {:.1} % nodata", 100.0 * (1.0 - e.valid_samples as f64 / e.samples as f64))?;
-    if e.diamonds > 0 || e.triangles == 0 {
-        writeln!(
-            out,
-            "  about {} diamonds, {} bytes of points ({:.2} bits a sample)",
-            e.diamonds, e.point_bytes, e.bits_per_sample
-        )?;
-    }
-    if e.triangles > 0 {
-        writeln!(out, "  about {} triangles of all levels, {} bytes", e.triangles, e.tin_bytes)?;
-    }
-    let mebibytes = |bytes: u64| bytes as f64 / f64::from(1 << 20);
-    writeln!(
-        out,
-        "  about {:.1} s with {} threads, at most {:.0} MiB of memory, {:.0} MiB of disk while at work",
-        e.seconds,
-        rayon::current_num_threads(),
-        mebibytes(e.memory_bytes),
-        mebibytes(e.disk_bytes)
-    )
-}
-
-fn print_report(out: &mut impl Write, store: &Path, report: &Report) -> std::io::Result<()> {
-    let layer = &report.scene.layers[0];
-    writeln!(out, "{}: scene '{}', version {}", store.display(), report.scene.name, report.scene.version)?;
-    writeln!(
-        out,
-        "  {} x {} samples of {:.3} x {:.3} m, heights {:.3} to {:.3} m, {:.1} % nodata",
-        layer.samples[0],
-        layer.samples[1],
-        layer.cell[0],
-        layer.cell[1],
-        layer.heights[0],
-        layer.heights[1],
-        100.0 * (1.0 - layer.valid_samples as f64 / report.samples as f64),
-    )?;
-    if report.diamonds > 0 || layer.tin.is_none() {
-        writeln!(
-            out,
-            "  {} diamonds, {} bytes of points ({:.3} bits a sample), {} bytes of index, finest error {} m",
-            report.diamonds,
-            report.point_bytes,
-            report.bits_per_sample,
-            report.index_bytes,
-            layer.finest_error,
-        )?;
-    }
-    if let Some(tin) = &layer.tin {
-        writeln!(
-            out,
-            "  {} triangles, {} bytes with their index, finest error {} m",
-            tin.triangles, tin.bytes, tin.finest_error
-        )?;
-    }
-    writeln!(out, "  {:.1} s, {:.2} Msamples/s", report.seconds, report.msamples_per_second)?;
-    writeln!(out, "Next: diamantina-server serve {}", store.display())
 }
 
 /// What holds for `serve`, of the arguments given, the environment and a file.
@@ -798,92 +734,7 @@ fn inspect_store(args: &InspectArgs) -> Result<(), Failure> {
     if args.json {
         shown(writeln!(out, "{}", serde_json::to_string_pretty(&inspection)?))?;
     } else {
-        shown(print_inspection(&mut out, &inspection))?;
-    }
-    Ok(())
-}
-
-fn print_inspection(out: &mut impl Write, i: &Inspection) -> std::io::Result<()> {
-    let crs = i.scene.frame.crs.as_ref().map_or("unknown", |c| &c.name);
-    writeln!(out, "scene {}  version {}  CRS {crs}", i.scene.name, i.scene.version)?;
-    for (layer, about) in i.layers.iter().zip(&i.scene.layers) {
-        let [columns, rows] = about.forest.roots();
-        writeln!(
-            out,
-            "layer {}: {} x {} samples of {:.3} x {:.3} m, {columns} x {rows} roots, quantum {} m, errors {}",
-            layer.name,
-            about.samples[0],
-            about.samples[1],
-            about.cell[0],
-            about.cell[1],
-            about.quantum,
-            layer.errors
-        )?;
-        if let Some(tin) = &layer.tin {
-            print_triangles(out, tin, about)?;
-        }
-        if !about.encodings.iter().any(|e| e == "points") {
-            continue;
-        }
-        writeln!(out, "  level  diamonds        bytes     step [m]   error min [m]   error max [m]")?;
-        for l in &layer.levels {
-            writeln!(
-                out,
-                "  {:>5} {:>9} {:>12} {:>12} {:>15} {:>15}",
-                l.level, l.diamonds, l.bytes, l.step, l.error_min, l.error_max
-            )?;
-        }
-        writeln!(out, "  finest error {} m (asked: {} m)", layer.finest_error, about.max_error)?;
-        writeln!(
-            out,
-            "  {} bytes of points, {:.3} bits a sample; {} bytes of index",
-            layer.point_bytes, layer.bits_per_sample, layer.index_bytes
-        )?;
-        if let (Some(real), Some(fictitious)) = (layer.real_points, layer.fictitious_points) {
-            writeln!(out, "  {real} real points, {fictitious} fictitious")?;
-        }
-    }
-    for zone in &i.scene.zones {
-        let ceilings: Vec<String> = zone.parts.iter().map(|part| format!("{:.3}", part.ceiling)).collect();
-        writeln!(
-            out,
-            "zone {}: eye {} m, up to {} m, hidden counts for {}, {} bytes",
-            zone.name,
-            zone.eye,
-            ceilings.join(", "),
-            zone.hidden,
-            zone.bytes
-        )?;
-    }
-    if i.verified {
-        writeln!(out, "verified: every blob matches its checksum and decodes")?;
-    }
-    Ok(())
-}
-
-fn print_triangles(out: &mut impl Write, i: &TinInspection, about: &Layer) -> std::io::Result<()> {
-    writeln!(
-        out,
-        "  level  diamonds        bytes    triangles   error min [m]   error max [m]   borders [m]   (tin)"
-    )?;
-    for l in &i.levels {
-        // How many there are is known once they are decoded.
-        let triangles = l.triangles.map_or_else(|| "-".to_owned(), |n| n.to_string());
-        writeln!(
-            out,
-            "  {:>5} {:>9} {:>12} {triangles:>12} {:>15} {:>15} {:>13.1}",
-            l.level, l.diamonds, l.bytes, l.error_min, l.error_max, l.apart_max
-        )?;
-    }
-    writeln!(out, "  finest error {} m (asked: {} m), errors {}", i.finest_error, about.max_error, i.errors)?;
-    writeln!(
-        out,
-        "  {} triangles in {} bytes, {:.3} bits each; {} bytes of index",
-        i.triangles, i.bytes, i.bits_per_triangle, i.index_bytes
-    )?;
-    if !i.cuts.is_empty() {
-        let cuts: Vec<String> = i.cuts.iter().map(|c| format!("{} m {}", c.error, c.triangles)).collect();
-        writeln!(out, "  triangles of the coarsest cut that keeps an error: {}", cuts.join(", "))?;
+        shown(print::inspection(&mut out, &inspection))?;
     }
     Ok(())
 }
@@ -922,7 +773,7 @@ fn compute_zone(args: ZoneArgs) -> Result<(), Failure> {
     if args.json {
         shown(writeln!(out, "{}", serde_json::to_string_pretty(&report)?))?;
     } else {
-        shown(print_zone(&mut out, &args.store, &report))?;
+        shown(print::zone(&mut out, &args.store, &report))?;
     }
     Ok(())
 }
@@ -939,42 +790,6 @@ fn refuse_zone(error: &ZoneError) -> Failure {
         _ => 1,
     };
     Failure(code, error.to_string())
-}
-
-fn print_zone(out: &mut impl Write, store: &Path, r: &zone::Report) -> std::io::Result<()> {
-    let share = |some: u64, all: u64| 100.0 * some as f64 / all.max(1) as f64;
-    writeln!(
-        out,
-        "{}: scene '{}', version {} (was {})",
-        store.display(),
-        r.scene,
-        r.version,
-        r.version_before
-    )?;
-    writeln!(
-        out,
-        "  zone '{}': {} polygons, up to {:.3} m, {} eyes {:.1} m apart, {} azimuths",
-        r.zone.name,
-        r.zone.parts.len(),
-        r.zone.parts.iter().map(|part| part.ceiling).fold(f64::NEG_INFINITY, f64::max),
-        r.eyes,
-        r.spacing,
-        r.azimuths
-    )?;
-    writeln!(
-        out,
-        "  {:.1} % of {} samples are seen, {:.1} % are hidden; of {} diamonds {:.1} % are hidden",
-        share(r.samples_seen, r.samples),
-        r.samples,
-        share(r.samples_hidden, r.samples),
-        r.diamonds,
-        share(r.diamonds_hidden, r.diamonds)
-    )?;
-    writeln!(
-        out,
-        "  {} bytes; {:.1} s: heights {:.1} s, rays {:.1} s",
-        r.zone.bytes, r.seconds, r.seconds_reading, r.seconds_casting
-    )
 }
 
 fn demonstrate(args: &DemoArgs) -> Result<(), Failure> {
@@ -1002,21 +817,5 @@ fn experiment(args: &ExperimentArgs, given: &clap::ArgMatches) -> Result<(), Fai
     if args.json {
         return Ok(shown(writeln!(out, "{}", serde_json::to_string_pretty(&report)?))?);
     }
-    Ok(shown(print_experiment(&mut out, &args.output, &report))?)
-}
-
-fn print_experiment(
-    out: &mut impl Write,
-    folder: &Path,
-    report: &experiment::report::Report,
-) -> std::io::Result<()> {
-    writeln!(out, "{}", report.title)?;
-    for note in &report.notes {
-        writeln!(out, "  {note}")?;
-    }
-    for table in &report.tables {
-        let file = folder.join(format!("{}.csv", table.name));
-        writeln!(out, "  {}: {} rows in {}", table.caption, table.rows.len(), file.display())?;
-    }
-    writeln!(out, "Next: open {}", folder.join("report.html").display())
+    Ok(shown(print::experiment(&mut out, &args.output, &report))?)
 }
