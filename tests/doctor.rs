@@ -3,8 +3,9 @@
 
 use crate::hostile::{Ended, end};
 use crate::service::certify;
-use crate::world::{World, programs, serve_with};
+use crate::world::{World, build, options, programs, serve, serve_with, write_raw};
 use diamantina_client::doctor::{Finding, Verdict, examine};
+use diamantina_server::hierarchy;
 use diamantina_server::http::{self, Options};
 use std::io::{Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -81,8 +82,15 @@ fn of_a_server_by_itself_all_is_good() {
 
 #[test]
 fn triangles_alone_are_examined_as_well() {
-    let world = World::whole_with_triangles(129);
-    let all = findings(&world.served.scene("world"));
+    let folder = tempfile::tempdir().unwrap();
+    let (dem, store) = (folder.path().join("dem.raw"), folder.path().join("store"));
+    let ingest = write_raw(&dem, [129, 129], |x, y| Some((x * y % 97) as f32));
+    let tin = Some(hierarchy::TinOptions::default());
+    build(&dem, &store, &ingest, &hierarchy::Options { points: false, tin, ..options() });
+    let served = serve(&[store]);
+    let all = findings(&served.scene("world"));
+    let routes = all.iter().find(|finding| finding.check == "payload").map(|finding| &finding.found);
+    assert!(routes.is_some_and(|found| found.contains("decode")), "{all:#?}");
     assert!(all.iter().all(|finding| finding.verdict == Verdict::Good), "{all:#?}");
 }
 
