@@ -25,6 +25,8 @@ mod http;
 mod limits;
 /// A slow and distant link, and that it is as slow and distant as asked.
 mod link;
+/// Many users at once.
+mod load;
 /// Progressive streams: what any prefix is worth, who may ask for what, and the client that draws from one.
 mod progressive;
 /// Law 7: a build that was killed, stopped or ran out of disk goes on; the bytes are those of an unbroken one.

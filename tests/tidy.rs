@@ -61,6 +61,7 @@ const CLIENT: &[(&str, &[&str])] = &[
     ("cache", &["surface"]),
     ("fetch", &["background", "encoding"]),
     ("doctor", &["encoding", "fetch", "surface"]),
+    ("load", &["cache", "camera", "cut", "encoding", "fetch", "headless", "overview", "sight", "surface"]),
     ("sight", &["camera"]),
     ("cut", &["camera", "drawing", "encoding", "morph", "sight", "surface"]),
     (

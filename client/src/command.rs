@@ -1,5 +1,7 @@
 //! The command line of the client.
 
+mod load;
+
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use diamantina_client::camera::{Camera, FOV_Y};
 use diamantina_client::doctor::{self, Verdict};
@@ -43,6 +45,8 @@ enum Command {
     View(ViewerArgs),
     /// Tell what is wrong with a server, as clients see it through all the proxies and caches before it
     Doctor(DoctorArgs),
+    /// Load a server with many users, and tell how it fares
+    Load(load::LoadArgs),
 }
 
 /// What a private scene asks for.
@@ -273,6 +277,7 @@ pub(crate) fn run() -> ExitCode {
         Command::Fly(args) => fly(&args),
         Command::View(args) => view(&args),
         Command::Doctor(args) => doctor(&args),
+        Command::Load(args) => load::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -19,6 +19,7 @@
 //! | [`picture`] | pixels → PNG |
 //! | [`overview`] | where a whole scene is seen from |
 //! | [`headless`] | pictures and flights without a window |
+//! | `load` | many users at once, to see what a server bears |
 //! | [`doctor`] | what is wrong with a server as clients see it |
 //! | [`viewer`] | the terrain with a panel and a mouse; in a window |
 //! | `web` | the same on a page, in a browser |
@@ -35,6 +36,8 @@ pub mod encoding;
 pub mod fetch;
 #[cfg(not(target_arch = "wasm32"))]
 pub mod headless;
+#[cfg(not(target_arch = "wasm32"))]
+pub mod load;
 pub mod morph;
 pub mod overview;
 pub mod pick;

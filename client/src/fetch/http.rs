@@ -7,10 +7,10 @@ use bytes::Bytes;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::{self, Entry};
-use diamantina_protocol::message::{self, Catalogue, Layer, Scene};
+use diamantina_protocol::message::{self, Catalogue, FrameHeader, Layer, Scene, Status};
 use diamantina_protocol::zone::{self, Mask};
 use futures_util::StreamExt as _;
-use reqwest::{Client, StatusCode, Url};
+use reqwest::{Client, Response, StatusCode, Url};
 use std::hash::BuildHasher;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -162,12 +162,7 @@ impl Http {
         if response.status() == StatusCode::OK {
             return Ok(Box::pin(response.bytes_stream()));
         }
-        let retry_after = response.headers().get("retry-after").and_then(|v| v.to_str().ok()?.parse().ok());
-        Err(FetchError::Status {
-            route: shortened(route),
-            status: response.status().as_u16(),
-            retry_after: retry_after.map(Duration::from_secs),
-        })
+        Err(refusal(route, &response))
     }
 
     async fn in_time<T>(&self, coming: impl Future<Output = reqwest::Result<T>>) -> Result<T, FetchError> {
@@ -258,10 +253,38 @@ fn is_passing(error: &FetchError) -> bool {
     matches!(error, FetchError::Transport(_) | FetchError::Status { status: 429 | 500.., .. })
 }
 
-fn only(mut catalogue: Catalogue) -> Result<Scene, FetchError> {
+pub(super) fn only(mut catalogue: Catalogue) -> Result<Scene, FetchError> {
     match catalogue.scenes.pop() {
         Some(scene) if catalogue.scenes.is_empty() => Ok(scene),
         last => Err(FetchError::Choose(catalogue.scenes.into_iter().chain(last).map(|s| s.name).collect())),
+    }
+}
+
+/// Whether a frame's payload is what was asked for, as far as its header and the index tell.
+pub(super) fn good_payload(
+    d: Diamond,
+    bytes: Option<u32>,
+    header: &FrameHeader,
+    payload: &Bytes,
+) -> Result<(), FetchError> {
+    match header.status {
+        Status::Ok if header.checksum != message::checksum(payload) => Err(FetchError::Damaged(d.centre())),
+        Status::Ok if bytes.is_some_and(|b| b != header.length) => Err(FetchError::Damaged(d.centre())),
+        // The index was not there to tell that there is none.
+        Status::Missing if bytes.is_none() && header.length == 0 => Ok(()),
+        Status::Missing | Status::Damaged => Err(FetchError::Missing(d.centre())),
+        Status::Page => Err(FetchError::Unasked(d.centre())),
+        Status::Ok => Ok(()),
+    }
+}
+
+/// What an answer that is no 200 means.
+pub(super) fn refusal(route: &str, response: &Response) -> FetchError {
+    let retry_after = response.headers().get("retry-after").and_then(|v| v.to_str().ok()?.parse().ok());
+    FetchError::Status {
+        route: shortened(route),
+        status: response.status().as_u16(),
+        retry_after: retry_after.map(Duration::from_secs),
     }
 }
 

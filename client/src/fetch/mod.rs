@@ -17,6 +17,7 @@
 //! | `http` | addresses, answers and their limits, what goes over the wire |
 //! | `tasks` | the wishes and the tasks that fulfil them |
 //! | `stream` | what comes without being wished for, and when it ends |
+//! | `once` | one request, sent once and timed |
 //! | `batch` | batches: put together, and cut from a stream of bytes |
 //! | `unpack` | zstd |
 //! | `error` | why something was not fetched |
@@ -25,6 +26,8 @@ mod batch;
 pub(crate) mod connect;
 mod error;
 mod http;
+#[cfg(not(target_arch = "wasm32"))]
+mod once;
 mod stream;
 mod tasks;
 mod unpack;
@@ -38,6 +41,8 @@ pub use http::LAYERS_MAX;
 pub(crate) use http::parse_address;
 #[cfg(not(target_arch = "wasm32"))]
 pub(crate) use http::{check as check_scene, decode_page, transport};
+#[cfg(not(target_arch = "wasm32"))]
+pub(crate) use once::{Answer, Ask, describe, one};
 
 use crate::background::Background;
 use crate::encoding::Encoding;

@@ -1,7 +1,7 @@
 //! The wishes, and the tasks that fulfil them: each takes the most urgent that nobody is fetching.
 
 use super::batch::{Batch, Frames};
-use super::http::{Http, PAGE_BYTES_MAX, count, decode_page, pause, shortened};
+use super::http::{Http, PAGE_BYTES_MAX, count, decode_page, good_payload, pause, shortened};
 use super::stream::weight;
 use super::{Event, FetchError, Key, REST, TRIES_MAX, Want};
 use crate::background::within;
@@ -9,7 +9,7 @@ use crate::encoding::Encoding;
 use bytes::Bytes;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
-use diamantina_protocol::message::{self, FrameHeader, Scene, Status, StreamAsk};
+use diamantina_protocol::message::{self, FrameHeader, Scene, StreamAsk};
 use foldhash::fast::RandomState;
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -255,19 +255,7 @@ impl Shared {
         header: &FrameHeader,
         payload: Bytes,
     ) -> Result<(), FetchError> {
-        match header.status {
-            Status::Ok if header.checksum != message::checksum(&payload) => {
-                return Err(FetchError::Damaged(d.centre()));
-            }
-            Status::Ok if bytes.is_some_and(|b| b != header.length) => {
-                return Err(FetchError::Damaged(d.centre()));
-            }
-            // The index was not there to tell that there is none.
-            Status::Missing if bytes.is_none() && header.length == 0 => {}
-            Status::Missing | Status::Damaged => return Err(FetchError::Missing(d.centre())),
-            Status::Page => return Err(FetchError::Unasked(d.centre())),
-            Status::Ok => {}
-        }
+        good_payload(d, bytes, header, &payload)?;
         self.deliver(Key::Diamond(layer, d), Event::Payload(layer, d, payload));
         Ok(())
     }
