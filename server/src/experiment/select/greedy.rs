@@ -80,11 +80,18 @@ pub fn greedy(
             queue.push_drawn(&tree, &facet);
             continue;
         }
-        let (point, off) = farthest(field, &facet);
+        let (mut point, off) = farthest(field, &facet);
+        let is_blind = criterion.splits_level() && field.at(point).is_nan();
+        if is_blind && let Some(below) = ground.known_below(&facet) {
+            point = below;
+        }
         let is_level = off == 0.0 && criterion.splits_level() && !field.at(point).is_nan();
         if is_level || off > share * error || (off > 0.0 && !criterion.is_distance()) {
             tree.add(point, field.at(point));
             points += 1;
+            if is_blind {
+                queue.push_drawn(&tree, &facet);
+            }
             for half in tree.around(point).into_iter().flatten().flat_map(|t| tree.halves(&t)) {
                 queue.push_drawn(&tree, &half);
             }

@@ -64,6 +64,13 @@ pub(super) fn descend(
         for facet in &now {
             let m = facet.middle();
             let off = off(ground, facet);
+            if off.is_nan() && criterion.splits_level() {
+                // Any real point below makes the middle fictitious.
+                if let Some(below) = ground.known_below(facet) {
+                    draft.add(below, field.at(below));
+                }
+                continue;
+            }
             // Whatever the middle's own weight: triangles that count hang on it.
             let is_off = if criterion.is_distance() {
                 off.abs() > share * tolerance
