@@ -2,7 +2,7 @@
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .NOTPARALLEL:
-.PHONY: help demo test test-long check contract objects bench bench-link bench-peers bench-serve bench-wasm setup fmt clippy tests doc deny wasm web web-test scripts
+.PHONY: help demo test test-long check contract objects bench bench-link bench-peers bench-serve bench-users bench-wasm setup fmt clippy tests doc deny wasm web web-test scripts
 
 # Mesa's device selection complains where there is no desktop session; there is nothing to select.
 export NODEVICE_SELECT := 1
@@ -19,6 +19,7 @@ help:
 	@echo "make bench   benchmarks, with a table at the end"
 	@echo "make bench-link    seconds to a view over slow links, on the DEMs of DIAMANTINA_DATA"
 	@echo "make bench-serve   requests a second beside nginx, where it and wrk are installed"
+	@echo "make bench-users   1000 users for five minutes, and 2000 idle connections"
 	@echo "make test-long     the tests that take too long for each change: every DEM of DIAMANTINA_DATA"
 	@echo "make bench-wasm    decoding in the browser's architecture, where it and node are installed"
 	@echo "make bench-peers   bytes, bounds and speed beside other codecs, on the DEMs of DIAMANTINA_DATA"
@@ -44,6 +45,10 @@ bench-link:
 bench-serve:
 	@$(step) setup scripts/setup demo
 	@$(step) serve scripts/bench-serve
+
+bench-users:
+	@$(step) setup scripts/setup demo
+	@$(step) users scripts/bench-users
 
 bench-wasm:
 	@$(step) wasm scripts/bench-wasm
@@ -99,4 +104,4 @@ web-test:
 	@$(step) web-test scripts/web-test
 
 scripts:
-	@$(step) scripts shellcheck .ci/run scripts/bench scripts/bench-link scripts/bench-peers scripts/bench-serve scripts/bench-wasm scripts/contract scripts/deny scripts/objects scripts/setup scripts/step scripts/wasm scripts/wasm-cargo scripts/web scripts/web-test
+	@$(step) scripts shellcheck .ci/run scripts/bench scripts/bench-link scripts/bench-peers scripts/bench-serve scripts/bench-users scripts/bench-wasm scripts/contract scripts/deny scripts/objects scripts/setup scripts/step scripts/wasm scripts/wasm-cargo scripts/web scripts/web-test

@@ -15,8 +15,11 @@ struct Frame {
     horizon: vec4<f32>,
     // rgb: the sky overhead.
     zenith: vec4<f32>,
-    // x: 1 to encode sRGB here, because the target does not. y: 1 to tint levels. z: 1 for one flat colour.
+    // x: 1 to encode sRGB here, because the target does not. y: 1 to tint levels. z: 1 for one flat colour. w: 1 for a sky
+    // that is as bright everywhere as at the horizon.
     options: vec4<f32>,
+    // rgb: water that mirrors nothing. w: metres from the eye up to the mirror below which nothing is drawn.
+    water: vec4<f32>,
     // rgb: colours of land, low to high. w: where each stands in the range of heights, 0 to 1.
     land: array<vec4<f32>, 8>,
     // rgb: colours of the sea, shallow to deep. w: where each stands in the range of depths, 0 to 1.
@@ -41,7 +44,8 @@ struct Layer {
     per_height: f32,
     // What heights are multiplied by.
     exaggeration: f32,
-    unused: f32,
+    // 1 for a layer of water.
+    is_water: f32,
 }
 
 @group(0) @binding(0) var<uniform> frame: Frame;
@@ -61,6 +65,21 @@ fn haze_to(up: f32, distance: f32) -> f32 {
         density = (density - exp(-point)) / rise;
     }
     return 1.0 - exp(-frame.horizon.w * density * distance);
+}
+
+// A colour behind the haze between it and the eye.
+fn hazed(colour: vec3<f32>, from_eye: vec3<f32>) -> vec3<f32> {
+    return mix(colour, frame.horizon.rgb, haze_to(from_eye.z, length(from_eye)));
+}
+
+// The sky in a direction of length 1: a gradient by height above the horizon.
+fn sky_towards(direction: vec3<f32>) -> vec3<f32> {
+    if frame.options.w != 0.0 {
+        return frame.horizon.rgb;
+    }
+    let above = mix(frame.horizon.rgb, frame.zenith.rgb, 1.0 - exp(-4.0 * max(direction.z, 0.0)));
+    // Below the horizon there is haze, darker further down.
+    return above * mix(1.0, 0.74, smoothstep(0.0, 0.7, -direction.z));
 }
 
 // The light that a surface sends back: the sun, and the sky's half sphere, brighter from above. The sun

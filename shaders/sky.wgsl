@@ -1,4 +1,4 @@
-// The sky: a gradient by height above the horizon, wherever nothing was drawn.
+// The sky, wherever nothing was drawn.
 
 struct Ray {
     @builtin(position) clip: vec4<f32>,
@@ -16,8 +16,5 @@ fn sky_vertex(@builtin(vertex_index) index: u32) -> Ray {
 
 @fragment
 fn sky_fragment(ray: Ray) -> @location(0) vec4<f32> {
-    let up = normalize(ray.direction).z;
-    let above = mix(frame.horizon.rgb, frame.zenith.rgb, 1.0 - exp(-4.0 * max(up, 0.0)));
-    // Below the horizon there is haze, darker further down.
-    return encoded(above * mix(1.0, 0.74, smoothstep(0.0, 0.7, -up)));
+    return encoded(sky_towards(normalize(ray.direction)));
 }

@@ -146,14 +146,20 @@ pub(crate) fn fly_over_magenta(
     let options = terrain::Options { tolerance_pixels: 0.2, fetch, ..terrain::Options::default() };
     let mut terrain = Terrain::open(&format!("{}/scenes/world", proxy.address), options).unwrap();
     let path = steep_flight(terrain.scene());
-    let flight =
-        Flight { frames: 300, frames_a_second: 30.0, size: [160, 120], pictures: None, patience: None };
+    let flight = Flight {
+        frames: 300,
+        frames_a_second: 30.0,
+        size: [160, 120],
+        pictures: None,
+        reads: true,
+        patience: None,
+    };
     let (mut begun, mut unfinished, mut cuts) = (false, 0, Vec::new());
     headless::fly(&mut terrain, &path, &flight, &over_magenta(), &sharp(), |line, picture| {
         cuts.push(line.cut_ms);
         begun |= line.diamonds > 0;
         unfinished += usize::from(begun && !line.complete);
-        let magenta = picture.pixels.chunks_exact(4).filter(|p| **p == MAGENTA).count();
+        let magenta = picture.unwrap().pixels.chunks_exact(4).filter(|p| **p == MAGENTA).count();
         if begun {
             assert_eq!(magenta, 0, "magenta in frame {}, which lacks data: {}", line.frame, !line.complete);
         } else {

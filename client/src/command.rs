@@ -1,6 +1,7 @@
 //! The command line of the client.
 
 mod load;
+mod look;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use diamantina_client::camera::{Camera, FOV_Y};
@@ -9,20 +10,15 @@ use diamantina_client::encoding::Encoding;
 use diamantina_client::fetch::{self, FetchError};
 use diamantina_client::headless::{self, Flight, FlightPath, FrameLine, PictureReport};
 use diamantina_client::morph;
-use diamantina_client::render::{self, Background, Colours, Look, Sun};
 use diamantina_client::sight::Sight;
 use diamantina_client::terrain::{self, Terrain, TerrainError};
 use diamantina_client::viewer::{self, Viewer};
-use diamantina_protocol::message::Scene;
 use glam::DVec3;
+use look::LookArgs;
 use std::io::{IsTerminal, Write};
-use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
-
-/// What heights may be multiplied by.
-const EXAGGERATION: RangeInclusive<f64> = 0.01..=1000.0;
 
 /// Seconds that points move in a window.
 const MORPH_SECONDS: f64 = 0.3;
@@ -108,39 +104,8 @@ struct ViewArgs {
     /// Memory for decoded diamonds
     #[arg(long, default_value = "1024", value_name = "MIB")]
     memory: usize,
-    /// Where the sun stands: degrees clockwise from north, degrees above the horizon [default: 315,45; 315,20
-    /// on other bodies than the Earth]
-    #[arg(long, value_name = "AZIMUTH,ALTITUDE", value_parser = parse_pair)]
-    sun: Option<[f64; 2]>,
-    /// What is behind the terrain: sky, or a colour as six hexadecimal digits [default: sky; black on other
-    /// bodies than the Earth]
-    #[arg(long, value_name = "sky|RRGGBB", value_parser = parse_background)]
-    background: Option<Background>,
-    /// What colours mean: terrain is coloured by height, bathymetry also by depth below 0 m; auto is grey on
-    /// other bodies than the Earth, and bathymetry where a tenth of the range of heights lies below 0 m
-    #[arg(long, default_value = "auto", value_enum)]
-    colours: ColourName,
-    /// What heights are multiplied by, to make gentle relief visible; errors and the heights of eye and
-    /// target are multiplied, too
-    #[arg(long, default_value_t = 1.0, value_name = "N")]
-    exaggeration: f64,
-    /// Tint diamonds by their level
-    #[arg(long)]
-    show_levels: bool,
-    /// Draw the sides of triangles
-    #[arg(long)]
-    wireframe: bool,
-    /// One sample a pixel: faster, with jagged edges
-    #[arg(long)]
-    no_antialias: bool,
-}
-
-#[derive(Clone, Copy, ValueEnum)]
-enum ColourName {
-    Auto,
-    Terrain,
-    Bathymetry,
-    Grey,
+    #[command(flatten)]
+    look: LookArgs,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -222,30 +187,10 @@ fn parse_point(text: &str) -> Result<DVec3, String> {
     numbers(text).map(DVec3::from_array)
 }
 
-fn parse_pair(text: &str) -> Result<[f64; 2], String> {
-    numbers(text)
-}
-
 fn parse_size(text: &str) -> Result<[u32; 2], String> {
     let pair = text.split_once('x').and_then(|(w, h)| Some([w.parse().ok()?, h.parse().ok()?]));
     pair.filter(|[w, h]: &[u32; 2]| *w > 0 && *h > 0)
         .ok_or_else(|| "expected WIDTHxHEIGHT in pixels, as in 1380x768".to_owned())
-}
-
-fn parse_background(text: &str) -> Result<Background, String> {
-    if text == "sky" {
-        return Ok(Background::Sky);
-    }
-    let digits = text.strip_prefix('#').unwrap_or(text);
-    let colour = (digits.len() == 6).then(|| u32::from_str_radix(digits, 16).ok()).flatten();
-    let colour = colour.ok_or("expected sky or six hexadecimal digits, as in ff00ff")?;
-    // The picture is sRGB, blending is linear.
-    #[allow(clippy::cast_possible_truncation, reason = "a colour needs no more than f32")]
-    let linear = |shift: u32| {
-        let c = f64::from(colour >> shift & 0xff) / 255.0;
-        (if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }) as f32
-    };
-    Ok(Background::Colour([linear(16), linear(8), linear(0), 1.0]))
 }
 
 /// A failure with its exit code: 1 failed, 2 wrong use.
@@ -297,13 +242,7 @@ impl ViewArgs {
                 format!("--error-pixels {}: expected a number above 0", self.error_pixels),
             ));
         }
-        if !EXAGGERATION.contains(&self.exaggeration) {
-            let [low, high] = [EXAGGERATION.start(), EXAGGERATION.end()];
-            return Err(Failure(
-                2,
-                format!("--exaggeration {}: expected a number from {low} to {high}", self.exaggeration),
-            ));
-        }
+        self.look.check()?;
         if !(self.foveation.is_finite() && self.foveation >= 1.0) {
             return Err(Failure(2, format!("--foveation {}: expected a number from 1 on", self.foveation)));
         }
@@ -334,31 +273,6 @@ impl ViewArgs {
             Failure(if wrong_use { 2 } else { 1 }, error.to_string())
         })
     }
-
-    fn look(&self, scene: &Scene) -> Look {
-        let look = Look::of(scene);
-        Look {
-            background: self.background.unwrap_or(look.background),
-            sun: self.sun.map_or(look.sun, |[azimuth_degrees, altitude_degrees]| Sun {
-                azimuth_degrees,
-                altitude_degrees,
-            }),
-            colours: match self.colours {
-                ColourName::Auto => look.colours,
-                ColourName::Terrain => Colours::Terrain,
-                ColourName::Bathymetry => Colours::Bathymetry,
-                ColourName::Grey => Colours::Grey,
-            },
-            exaggeration: self.exaggeration,
-            show_levels: self.show_levels,
-            wireframe: self.wireframe,
-            ..look
-        }
-    }
-
-    fn options(&self) -> render::Options {
-        render::Options { samples: if self.no_antialias { 1 } else { 4 }, ..render::Options::default() }
-    }
 }
 
 fn render(args: &RenderArgs) -> Result<(), Failure> {
@@ -368,7 +282,8 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
         return Err(Failure(2, "streams are of points: leave --stream or --encoding tin out".to_owned()));
     }
     let mut terrain = args.view.open(0.0)?;
-    let ViewArgs { size, exaggeration, .. } = args.view;
+    let ViewArgs { size, .. } = args.view;
+    let exaggeration = args.view.look.exaggeration;
     let camera = match (args.eye, args.target) {
         (Some(eye), Some(target)) if eye == target => {
             return Err(Failure(
@@ -391,8 +306,9 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
             headless::framed(&mut terrain, size, exaggeration, patience)
         }
     };
-    let look = args.view.look(terrain.scene());
-    let (picture, report) = headless::picture(&mut terrain, &camera, &look, &args.view.options(), patience)?;
+    let look = args.view.look.look(terrain.scene());
+    let (picture, report) =
+        headless::picture(&mut terrain, &camera, &look, &args.view.look.options(), patience)?;
     headless::save(&picture, &args.output)?;
     if let Some(path) = &args.json {
         let mut out = headless::open_text(path)?;
@@ -457,10 +373,10 @@ fn view(args: &ViewerArgs) -> Result<(), Failure> {
     };
     let view = ViewArgs { url: url.clone(), ..args.view.clone() };
     let terrain = view.open(morph)?;
-    let look = view.look(terrain.scene());
+    let look = view.look.look(terrain.scene());
     let title = format!("{} - Diamantina", terrain.scene().name);
     let viewer = Viewer::new(terrain, &url, look, view.size, at);
-    viewer::window::run(viewer, &title, &view.options()).map_err(|e| Failure(1, e.to_string()))
+    viewer::window::run(viewer, &title, &view.look.options()).map_err(|e| Failure(1, e.to_string()))
 }
 
 fn doctor(args: &DoctorArgs) -> Result<(), Failure> {
@@ -536,13 +452,14 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
         frames_a_second: args.fps,
         size: args.view.size,
         pictures: args.pictures.clone(),
+        reads: false,
         patience,
     };
     let (mut slowest_cut, mut draw_sum, mut last) = (0.0f64, 0.0, None);
     let mut failed = None;
     let bar = indicatif::ProgressBar::new(args.frames.into());
-    let look = args.view.look(terrain.scene());
-    headless::fly(&mut terrain, &path, &flight, &look, &args.view.options(), |line, _| {
+    let look = args.view.look.look(terrain.scene());
+    headless::fly(&mut terrain, &path, &flight, &look, &args.view.look.options(), |line, _| {
         slowest_cut = slowest_cut.max(line.cut_ms);
         draw_sum += line.draw_ms;
         bar.inc(1);

@@ -377,6 +377,9 @@ pub struct Flight {
     pub size: [u32; 2],
     /// A folder for a PNG of each frame.
     pub pictures: Option<PathBuf>,
+    /// Whether pictures come back from the graphics adapter even where they are not written; else each frame waits until
+    /// it is drawn.
+    pub reads: bool,
     /// Let each frame wait up to so long for data, so that what a flight takes follows from its path alone.
     pub patience: Option<Duration>,
 }
@@ -390,7 +393,7 @@ pub struct FrameLine {
     pub seconds: f64,
     /// Milliseconds to choose the cut and take what has arrived.
     pub cut_ms: f64,
-    /// Milliseconds to upload and draw, until the picture is there.
+    /// Milliseconds to upload and draw, until the picture is there; and to read it back, where pictures are.
     pub draw_ms: f64,
     /// The largest error of what is drawn, in pixels, as in [`PictureReport`]; `inf` until all roots are there.
     pub error_pixels: f64,
@@ -474,7 +477,7 @@ pub fn fly(
     flight: &Flight,
     look: &Look,
     options: &render::Options,
-    mut each: impl FnMut(&FrameLine, &Picture) -> Result<(), HeadlessError>,
+    mut each: impl FnMut(&FrameLine, Option<&Picture>) -> Result<(), HeadlessError>,
 ) -> Result<(), HeadlessError> {
     let mut offscreen = Offscreen::new(options)?;
     let layers = terrain.scene().layers.clone();
@@ -497,8 +500,16 @@ pub fn fly(
         let view = terrain.frame_at(&drawn, seconds);
         let cut_ms = clock.elapsed().as_secs_f64() * 1e3;
         let clock = Instant::now();
-        let stats = offscreen.draw(&layers, &drawn, &view.items, look)?;
-        let picture = offscreen.read()?;
+        // Waves move in the path's time, too.
+        let mut look = *look;
+        look.water.seconds += seconds;
+        let stats = offscreen.draw(&layers, &drawn, &view.items, &look)?;
+        let picture = if flight.reads || flight.pictures.is_some() {
+            Some(offscreen.read()?)
+        } else {
+            offscreen.wait()?;
+            None
+        };
         let draw_ms = clock.elapsed().as_secs_f64() * 1e3;
         let line = FrameLine {
             frame,
@@ -523,10 +534,10 @@ pub fn fly(
             fictitious_points: view.stats.points_fictitious,
             zone_in_effect: view.stats.zone_in_effect,
         };
-        if let Some(folder) = &flight.pictures {
-            save(&picture, &folder.join(format!("frame-{frame:05}.png")))?;
+        if let (Some(folder), Some(picture)) = (&flight.pictures, &picture) {
+            save(picture, &folder.join(format!("frame-{frame:05}.png")))?;
         }
-        each(&line, &picture)?;
+        each(&line, picture.as_ref())?;
     }
     Ok(())
 }

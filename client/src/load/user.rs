@@ -30,7 +30,7 @@ const VIEW_PATIENCE: Duration = Duration::from_secs(30);
 const PAUSE: Duration = Duration::from_millis(500);
 
 /// Places that a user without a path looks at, again and again.
-const PLACES: u32 = 64;
+const PLACES: u32 = 512;
 
 /// Numbers that look random, the same from the same beginning (splitmix64).
 struct Dice(u64);

@@ -5,9 +5,9 @@
 //! what follows is the same for all diamonds of a layer: a shared point has the same bits in each.
 //! Near the eye the differences are small, so `f32` holds them to a millionth of a cell.
 
-use super::{Colours, Look};
-use crate::camera::Camera;
-use diamantina_protocol::message::Layer;
+use super::look::{Background, Colours, Look};
+use super::view::View;
+use diamantina_protocol::message::{Kind, Layer};
 use glam::DVec3;
 
 /// Haze of a metre of air at height 0, for a haze of 1: 13 % at 10 km.
@@ -55,6 +55,9 @@ const HILLS: f64 = 0.62;
 const HORIZON: u32 = 0xd3_e0_ec;
 const ZENITH: u32 = 0x4f_80_bd;
 
+/// Water that mirrors nothing.
+const WATER: u32 = 0x4a_86_ab;
+
 /// The twin of `Frame`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
@@ -67,6 +70,7 @@ pub(super) struct FrameUniform {
     horizon: [f32; 4],
     zenith: [f32; 4],
     options: [f32; 4],
+    water: [f32; 4],
     land: [[f32; 4]; 8],
     sea: [[f32; 4]; 4],
 }
@@ -84,7 +88,7 @@ pub(super) struct LayerUniform {
     land_base: f32,
     per_height: f32,
     exaggeration: f32,
-    unused: f32,
+    is_water: f32,
 }
 
 /// Where the eye is in a layer: the lattice point that positions are relative to.
@@ -129,7 +133,7 @@ impl Reference {
             land_base: single(land_base),
             per_height: ratio(top(look.colours, highest), highest - land_base),
             exaggeration: single(look.exaggeration),
-            unused: 0.0,
+            is_water: f32::from(u8::from(layer.kind == Kind::Water)),
         }
     }
 }
@@ -153,27 +157,31 @@ fn top(colours: Colours, highest: f64) -> f64 {
 }
 
 impl FrameUniform {
-    /// The uniforms of a frame. `encode`: whether the target stores colours as they are, so that the
+    /// The uniforms of a pass. `encode`: whether the target stores colours as they are, so that the
     /// shader must encode sRGB. `near`: the near plane, in metres.
-    pub(super) fn new(camera: &Camera, look: &Look, near: f32, encode: bool) -> Self {
-        let [right, up, backward] = camera.axes();
-        let tan = (camera.fov_y / 2.0).tan();
-        let [width, height] = camera.size.map(|s| f64::from(s.max(1)));
+    pub(super) fn new(view: &View, look: &Look, near: f32, encode: bool) -> Self {
         let with = |v: DVec3, w: f32| v.as_vec3().extend(w).to_array();
+        let [right, up, forward] = view.rays().map(|ray| with(ray, 0.0));
         let colour = |srgb: u32, w: f32| {
             let [r, g, b] = linear(srgb);
             [r, g, b, w]
         };
         let flag = |on: bool| f32::from(u8::from(on));
+        let (zenith, even) = match look.background {
+            Background::Sky => (colour(ZENITH, 0.0), false),
+            Background::Colour(even) => (even, true),
+        };
+        let [r, g, b] = linear(WATER);
         Self {
-            clip_from_eye: camera.clip_from_eye(near).to_cols_array_2d(),
-            right: with(right * tan * width / height, 0.0),
-            up: with(up * tan, 0.0),
-            forward: with(-backward, 0.0),
-            sun: with(look.sun.direction(), single(camera.eye.z)),
+            clip_from_eye: view.clip_from_eye(near).to_cols_array_2d(),
+            right,
+            up,
+            forward,
+            sun: with(look.sun.direction(), single(view.eye().z)),
             horizon: colour(HORIZON, look.haze * HAZE_PER_METRE),
-            zenith: colour(ZENITH, 0.0),
-            options: [flag(encode), flag(look.show_levels), flag(look.colours == Colours::Flat), 0.0],
+            zenith,
+            options: [flag(encode), flag(look.show_levels), flag(look.colours == Colours::Flat), flag(even)],
+            water: [r, g, b, single(view.lowest())],
             land: if look.colours == Colours::Grey { ROCK } else { LAND }.map(|(at, srgb)| colour(srgb, at)),
             sea: SEA.map(|(at, srgb)| colour(srgb, at)),
         }
@@ -200,8 +208,15 @@ mod tests {
     use super::*;
     use std::mem::offset_of;
 
-    const SHADERS: [(&str, &str); 2] =
-        [("terrain.wgsl", super::super::TERRAIN_WGSL), ("sky.wgsl", super::super::SKY_WGSL)];
+    use super::super::pipelines::{SKY_WGSL, TERRAIN_WGSL, WATER_WGSL};
+    use super::super::water::WaterUniform;
+
+    const SHADERS: [(&str, &str, usize); 3] = [
+        // Vertices at rest, in motion and of irregular triangles; terrain, mirrored terrain, and wires.
+        ("terrain.wgsl", TERRAIN_WGSL, 6),
+        ("water.wgsl", WATER_WGSL, 4),
+        ("sky.wgsl", SKY_WGSL, 2),
+    ];
 
     /// Whatever a browser's WebGL2 takes, the others take too.
     fn translate(module: &naga::Module, info: &naga::valid::ModuleInfo, entry: &naga::EntryPoint) -> String {
@@ -224,7 +239,7 @@ mod tests {
 
     #[test]
     fn every_shader_is_valid_and_fit_for_webgl2() {
-        for (name, source) in SHADERS {
+        for (name, source, entries) in SHADERS {
             let module = naga::front::wgsl::parse_str(source)
                 .unwrap_or_else(|e| panic!("{}", e.emit_to_string_with_path(source, name)));
             // No capabilities: what any device has, browsers included.
@@ -233,8 +248,7 @@ mod tests {
             let info = naga::valid::Validator::new(flags, capabilities)
                 .validate(&module)
                 .unwrap_or_else(|e| panic!("{}", e.emit_to_string_with_path(source, name)));
-            // Terrain has two more vertex shaders, for what moves and for irregular triangles, and one for wires.
-            assert_eq!(module.entry_points.len(), if name == "terrain.wgsl" { 5 } else { 2 }, "{name}");
+            assert_eq!(module.entry_points.len(), entries, "{name}");
             for entry in &module.entry_points {
                 assert!(translate(&module, &info, entry).contains("#version 300 es"));
             }
@@ -246,13 +260,14 @@ mod tests {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../shaders");
         for entry in std::fs::read_dir(folder).unwrap() {
             let name = entry.unwrap().file_name().into_string().unwrap();
-            assert!(name == "frame.wgsl" || SHADERS.iter().any(|(n, _)| *n == name), "{name}");
+            let is_part = ["frame.wgsl", "surface.wgsl"].contains(&&*name);
+            assert!(is_part || SHADERS.iter().any(|(n, ..)| *n == name), "{name}");
         }
     }
 
     /// Name, offset and, last, the size of the whole.
     fn layout(name: &str) -> Vec<(String, usize)> {
-        let module = naga::front::wgsl::parse_str(super::super::TERRAIN_WGSL).unwrap();
+        let module = naga::front::wgsl::parse_str(WATER_WGSL).unwrap();
         let (_, found) = module.types.iter().find(|(_, t)| t.name.as_deref() == Some(name)).unwrap();
         let naga::TypeInner::Struct { members, span } = &found.inner else { panic!("{name} is no struct") };
         let mut layout: Vec<_> =
@@ -269,11 +284,13 @@ mod tests {
 
     #[test]
     fn uniforms_have_the_layout_of_their_twins() {
-        let frame = twin!(FrameUniform: clip_from_eye right up forward sun horizon zenith options land sea);
+        let frame =
+            twin!(FrameUniform: clip_from_eye right up forward sun horizon zenith options water land sea);
         assert_eq!(layout("Frame"), frame);
-        let layer = twin!(LayerUniform: cell offset quantum up_offset height per_depth land_base per_height exaggeration unused);
+        let layer = twin!(LayerUniform: cell offset quantum up_offset height per_depth land_base per_height exaggeration is_water);
         assert_eq!(layout("Layer"), layer);
-        let sizes = [size_of::<FrameUniform>(), size_of::<LayerUniform>()];
+        assert_eq!(layout("Water"), twin!(WaterUniform: absorption body optics waves));
+        let sizes = [size_of::<FrameUniform>(), size_of::<LayerUniform>(), size_of::<WaterUniform>()];
         assert!(sizes.iter().all(|s| s.is_multiple_of(16)), "WebGL2 wants it");
     }
 

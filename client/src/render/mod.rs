@@ -2,8 +2,12 @@
 //!
 //! | module | what it holds |
 //! |---|---|
+//! | `look` | light, colours, water: what a caller may choose |
 //! | `frame` | the uniforms, and how positions stay exact far from the origin |
+//! | `view` | where a pass draws from: the eye, or its mirror image |
+//! | `pipelines` | how vertices become pixels |
 //! | `resident` | surfaces on the GPU, under a budget |
+//! | `water` | what is mirrored in water and seen through it |
 //! | `offscreen` | pictures without a window |
 //!
 //! A diamond is one or two draws: its points at their own buffer, its place and axes as an instance, the
@@ -12,30 +16,31 @@
 //! indirect draws. Depth is reversed and infinite, positions are relative to the eye.
 
 mod frame;
+mod look;
 #[cfg(not(target_arch = "wasm32"))]
 mod offscreen;
+mod pipelines;
 mod resident;
+mod view;
+mod water;
 
 #[cfg(test)]
 mod tests;
 
+pub use look::{Background, Colours, Look, Sun, Water};
 #[cfg(not(target_arch = "wasm32"))]
 pub use offscreen::Offscreen;
 
-use crate::camera::{Camera, nearest_drawn};
+use crate::camera::{Bounds, Camera, nearest_drawn};
 use crate::drawing::DrawItem;
-use crate::morph::Record;
-use crate::surface::{Corner, Surface};
-use diamantina_protocol::message::{Layer, Scene};
+use crate::surface::Surface;
+use diamantina_protocol::message::{self, Layer};
 use frame::{FrameUniform, LayerUniform, Reference, single};
-use glam::DVec3;
-use resident::{Residents, SurfacePoint, Triangles};
+use pipelines::{Kind, Mode, Pipelines, Target, sky_pipeline, terrain_pipelines};
+use resident::{Residents, Triangles};
 use std::ops::Range;
-
-const TERRAIN_WGSL: &str =
-    concat!(include_str!("../../../shaders/frame.wgsl"), include_str!("../../../shaders/terrain.wgsl"));
-const SKY_WGSL: &str =
-    concat!(include_str!("../../../shaders/frame.wgsl"), include_str!("../../../shaders/sky.wgsl"));
+use view::View;
+use water::WaterPasses;
 
 const DEPTH: wgpu::TextureFormat = wgpu::TextureFormat::Depth32Float;
 
@@ -61,112 +66,6 @@ impl Default for Options {
     fn default() -> Self {
         Self { format: wgpu::TextureFormat::Rgba8UnormSrgb, samples: 4, budget_bytes: 512 << 20 }
     }
-}
-
-/// How a frame looks.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Look {
-    /// What is seen where no terrain is.
-    pub background: Background,
-    /// Where the light comes from.
-    pub sun: Sun,
-    /// What terrain is coloured by.
-    pub colours: Colours,
-    /// The thickness of the air: 0 is none, 1 a clear day.
-    pub haze: f32,
-    /// What heights are multiplied by; above 0. The camera's positions count in stretched heights.
-    pub exaggeration: f64,
-    /// Whether to tint diamonds by level.
-    pub show_levels: bool,
-    /// Whether to draw the sides of triangles.
-    pub wireframe: bool,
-}
-
-impl Default for Look {
-    fn default() -> Self {
-        Self {
-            background: Background::Sky,
-            sun: Sun::default(),
-            colours: Colours::Auto,
-            haze: 1.0,
-            exaggeration: 1.0,
-            show_levels: false,
-            wireframe: false,
-        }
-    }
-}
-
-impl Look {
-    /// How a scene looks unless told otherwise: other bodies than the Earth are grey, without air, and the sun
-    /// stands low, as plains of dust show little relief else.
-    #[must_use]
-    pub fn of(scene: &Scene) -> Self {
-        let radius = scene.frame.crs.as_ref().and_then(|crs| crs.proj4.as_deref()).and_then(radius);
-        if radius.is_none_or(|metres| (metres - EARTH_RADIUS).abs() < 100_000.0) {
-            return Self::default();
-        }
-        let black = Background::Colour([0.003, 0.003, 0.004, 1.0]);
-        let sun = Sun { altitude_degrees: 20.0, ..Sun::default() };
-        Self { background: black, sun, colours: Colours::Grey, haze: 0.0, ..Self::default() }
-    }
-}
-
-/// Metres from the Earth's centre, give or take 20 km.
-const EARTH_RADIUS: f64 = 6_371_000.0;
-
-/// The radius that a PROJ string names by number, in metres.
-fn radius(proj4: &str) -> Option<f64> {
-    proj4.split_whitespace().find_map(|w| w.strip_prefix("+R=").or(w.strip_prefix("+a=")))?.parse().ok()
-}
-
-/// What is seen where no terrain is.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Background {
-    /// A gradient from the horizon to overhead.
-    Sky,
-    /// One colour: linear red, green, blue and alpha.
-    Colour([f32; 4]),
-}
-
-/// The direction to the sun.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Sun {
-    /// Degrees from north, clockwise.
-    pub azimuth_degrees: f64,
-    /// Degrees above the horizon.
-    pub altitude_degrees: f64,
-}
-
-impl Default for Sun {
-    /// North-west and half way up: the custom of maps, which makes valleys look like valleys.
-    fn default() -> Self {
-        Self { azimuth_degrees: 315.0, altitude_degrees: 45.0 }
-    }
-}
-
-impl Sun {
-    /// The unit vector towards the sun: x east, y north, z up.
-    #[must_use]
-    pub fn direction(self) -> DVec3 {
-        let (azimuth, altitude) = (self.azimuth_degrees.to_radians(), self.altitude_degrees.to_radians());
-        DVec3::new(azimuth.sin() * altitude.cos(), azimuth.cos() * altitude.cos(), altitude.sin())
-    }
-}
-
-/// What terrain is coloured by.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Colours {
-    /// As `Bathymetry` for layers a good part of whose range is below 0 m, as `Terrain` for others: lowlands
-    /// and noise around 0 m are no sea.
-    Auto,
-    /// Height, over the layer's range.
-    Terrain,
-    /// Height, and depth below 0 m.
-    Bathymetry,
-    /// Height, from dark to light grey: for bodies without plants and water.
-    Grey,
-    /// Nothing: one grey.
-    Flat,
 }
 
 /// What a frame cost.
@@ -274,28 +173,10 @@ struct Draw<'a> {
     sides: u8,
     shares_triangles: bool,
     kind: Kind,
+    /// Stretched, as is the distance of the eye from it.
+    bounds: Bounds,
     distance: f64,
 }
-
-/// What a diamond's vertices are.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Kind {
-    Points,
-    MovingPoints,
-    Corners,
-}
-
-/// How triangles are drawn.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Mode {
-    Filled,
-    /// A little farther away than they are, so that lines along their sides are seen.
-    Behind,
-    Lines,
-}
-
-/// A pipeline for each kind.
-type Pipelines = [wgpu::RenderPipeline; 3];
 
 /// Draws frames to views that the caller owns.
 pub struct Renderer {
@@ -306,13 +187,20 @@ pub struct Renderer {
     filled: Pipelines,
     /// Behind, and lines: made when they are first needed.
     wires: Option<[Pipelines; 2]>,
-    terrain_groups: [wgpu::BindGroupLayout; 2],
+    /// Of the uniforms of a pass, and of a layer.
+    groups: [wgpu::BindGroupLayout; 2],
     sky: wgpu::RenderPipeline,
+    lens: Lens,
+    water: Option<WaterPasses>,
+    attachments: Option<Attachments>,
+}
+
+/// What a pass is told of where it draws from: uniforms, and the places of its diamonds.
+struct Lens {
+    frame: wgpu::Buffer,
     frame_group: wgpu::BindGroup,
-    frame_uniform: wgpu::Buffer,
     layers: Option<(wgpu::Buffer, wgpu::BindGroup)>,
     instances: Option<wgpu::Buffer>,
-    attachments: Option<Attachments>,
 }
 
 /// The textures of a frame besides the target.
@@ -342,33 +230,20 @@ impl Renderer {
                 }],
             })
         };
-        let frame_layout = layout("frame", false, size_of::<FrameUniform>());
-        let layer_layout = layout("layer", true, size_of::<LayerUniform>());
-        let frame_uniform = device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some("frame"),
-            size: size_of::<FrameUniform>() as u64,
-            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
-        let frame_group = device.create_bind_group(&wgpu::BindGroupDescriptor {
-            label: Some("frame"),
-            layout: &frame_layout,
-            entries: &[wgpu::BindGroupEntry { binding: 0, resource: frame_uniform.as_entire_binding() }],
-        });
-        let terrain_groups = [frame_layout.clone(), layer_layout];
-        let filled = terrain_pipelines(&device, options, &terrain_groups, Mode::Filled);
-        let sky = sky_pipeline(&device, options, &[Some(&frame_layout)]);
+        let groups = [
+            layout("frame", false, size_of::<FrameUniform>()),
+            layout("layer", true, size_of::<LayerUniform>()),
+        ];
+        let target = Target { format: options.format, samples: options.samples };
         Self {
             residents: Residents::new(options.budget_bytes),
             options: *options,
-            filled,
+            filled: terrain_pipelines(&device, target, &groups.each_ref(), Mode::Filled),
             wires: None,
-            terrain_groups,
-            sky,
-            frame_group,
-            frame_uniform,
-            layers: None,
-            instances: None,
+            sky: sky_pipeline(&device, target, &groups[0]),
+            lens: Lens::new(&device, &groups),
+            groups,
+            water: None,
             attachments: None,
             device,
             queue,
@@ -387,7 +262,7 @@ impl Renderer {
         &self.queue
     }
 
-    /// Draws a frame to `view`, which is of `camera.size` pixels and of the format of the options, and
+    /// Draws a frame to `target`, which is of `camera.size` pixels and of the format of the options, and
     /// sends it to the GPU; does not wait for it. Surfaces not seen before are uploaded.
     ///
     /// Items whose layer is not in `layers`, or whose surface is of another number of segments than the
@@ -398,69 +273,101 @@ impl Renderer {
         camera: &Camera,
         items: &[DrawItem],
         look: &Look,
-        view: &wgpu::TextureView,
+        target: &wgpu::TextureView,
     ) -> FrameStats {
         let uploaded_bytes = self.residents.start_frame(&self.device, layers, items, look.wireframe);
+        let mut stats =
+            FrameStats { uploaded_bytes, gpu_bytes: self.residents.bytes(), ..Default::default() };
         if look.wireframe && self.wires.is_none() {
-            let made = |mode| terrain_pipelines(&self.device, &self.options, &self.terrain_groups, mode);
+            let made = |mode| terrain_pipelines(&self.device, self.target(), &self.groups.each_ref(), mode);
             self.wires = Some([made(Mode::Behind), made(Mode::Lines)]);
         }
-        let draws = self.in_view(layers, camera, items, look.exaggeration);
-        self.write_uniforms(layers, camera, look, &draws);
         let attachments = match self.attachments.take() {
             Some(old) if old.size == camera.size => old,
             _ => Attachments::new(&self.device, &self.options, camera.size),
         };
-        let mut stats =
-            FrameStats { uploaded_bytes, gpu_bytes: self.residents.bytes(), ..Default::default() };
+        let view = View::straight(camera);
+        let mut draws = self.in_view(layers, &view, items, look, |item| !self.is_water(layers, item, look));
+        let land_count = draws.len();
+        draws.extend(self.in_view(layers, &view, items, look, |item| self.is_water(layers, item, look)));
+        let (land, surfaces) = draws.split_at(land_count);
+        let mut lens = std::mem::replace(&mut self.lens, Lens::new(&self.device, &self.groups));
+        lens.write(self, layers, &view, look, &draws, !self.options.format.is_srgb());
         let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        let mut water = self.water.take();
+        if !surfaces.is_empty() {
+            water.get_or_insert_with(|| WaterPasses::new(self, camera.size)).prepare(
+                self,
+                &mut encoder,
+                layers,
+                camera,
+                items,
+                look,
+                surfaces,
+                &mut stats,
+            );
+        }
         {
-            let mut pass = begin_pass(&mut encoder, &attachments, view, look, self.options.format);
+            let mut pass = begin_pass(&mut encoder, &attachments, target, look, self.options.format);
             match self.wires.as_ref().filter(|_| look.wireframe) {
-                None => self.draw_terrain(&mut pass, &draws, &self.filled, false, &mut stats),
+                None => self.draw_surfaces(&mut pass, &lens, land, 0, &self.filled, false, &mut stats),
                 Some([behind, lines]) => {
-                    self.draw_terrain(&mut pass, &draws, behind, false, &mut stats);
-                    self.draw_terrain(&mut pass, &draws, lines, true, &mut FrameStats::default());
+                    self.draw_surfaces(&mut pass, &lens, land, 0, behind, false, &mut stats);
+                    let mut uncounted = FrameStats::default();
+                    self.draw_surfaces(&mut pass, &lens, land, 0, lines, true, &mut uncounted);
                 }
             }
-            if look.background == Background::Sky {
-                pass.set_pipeline(&self.sky);
-                pass.set_bind_group(0, &self.frame_group, &[]);
-                pass.draw(0..3, 0..1);
+            if let Some(water) = &water {
+                let first = u32::try_from(land_count).unwrap_or(0);
+                water.draw(self, &mut pass, &lens, surfaces, first, &mut stats);
             }
+            lens.draw_sky(&mut pass, &self.sky, look);
         }
-        self.attachments = Some(attachments);
+        (self.lens, self.water, self.attachments) = (lens, water, Some(attachments));
         self.queue.submit([encoder.finish()]);
         stats
     }
 
-    /// The items that the camera may see, in an order that switches index buffers seldom and draws what
+    fn target(&self) -> Target {
+        Target { format: self.options.format, samples: self.options.samples }
+    }
+
+    /// Whether an item is drawn as water, by passes of its own.
+    #[allow(clippy::unused_self, reason = "asked of the renderer by its parts")]
+    fn is_water(&self, layers: &[Layer], item: &DrawItem, look: &Look) -> bool {
+        let is_water = layers.get(item.layer).is_some_and(|layer| layer.kind == message::Kind::Water);
+        is_water && look.water.reflecting && !look.wireframe
+    }
+
+    /// Those items that a view may see, in an order that switches index buffers seldom and draws what
     /// is near first, so that it hides what is behind at the least cost.
     fn in_view<'a>(
         &self,
         layers: &[Layer],
-        camera: &Camera,
+        view: &View,
         items: &'a [DrawItem],
-        exaggeration: f64,
+        look: &Look,
+        is_wanted: impl Fn(&DrawItem) -> bool,
     ) -> Vec<Draw<'a>> {
-        let planes = camera.planes();
+        let planes = view.planes();
         let mut draws: Vec<_> = items
             .iter()
+            .filter(|item| is_wanted(item))
             .filter_map(|item| {
                 let resident = self.residents.get(item)?;
                 let layer = layers.get(item.layer)?;
-                let bounds = resident.bounds(layer.quantum).map(|b| b.stretched(exaggeration));
+                let bounds = resident.bounds(layer.quantum).map(|b| b.stretched(look.exaggeration));
                 let bounds = bounds.filter(|b| b.touches(&planes))?;
                 let upper = layer.forest.local(item.diamond).upper;
                 let sides = item.sides & if upper { 0b1111 } else { 0b0011 };
-                let distance = bounds.distance(camera.eye);
+                let distance = bounds.distance(view.eye());
                 let shares_triangles = resident.own.is_none();
                 let kind = match &*item.surface {
                     Surface::Tin(_) => Kind::Corners,
                     Surface::Points(_) if resident.motion.is_some() => Kind::MovingPoints,
                     Surface::Points(_) => Kind::Points,
                 };
-                Some(Draw { item, sides, shares_triangles, kind, distance })
+                Some(Draw { item, sides, shares_triangles, kind, bounds, distance })
             })
             .collect();
         draws.sort_by(|a, b| {
@@ -470,77 +377,25 @@ impl Renderer {
         draws
     }
 
-    fn write_uniforms(&mut self, layers: &[Layer], camera: &Camera, look: &Look, draws: &[Draw<'_>]) {
-        let nearest = draws.iter().map(|d| d.distance).fold(NEAR_MAX, f64::min);
-        // A little before the nearest box: rounding must not cut it.
-        let near = single((0.9 * nearest).max(nearest_drawn(layers.iter().flat_map(|layer| layer.cell))));
-        let frame = FrameUniform::new(camera, look, near, !self.options.format.is_srgb());
-        self.queue.write_buffer(&self.frame_uniform, 0, bytemuck::bytes_of(&frame));
-
-        let references: Vec<_> =
-            layers.iter().map(|layer| Reference::near(layer, camera.eye, look.exaggeration)).collect();
-        let mut uniforms = vec![0u8; LAYER_STRIDE * layers.len().max(1)];
-        for ((layer, reference), slot) in
-            layers.iter().zip(&references).zip(uniforms.chunks_mut(LAYER_STRIDE))
-        {
-            let uniform = reference.uniform(layer, camera.eye, look);
-            slot[..size_of::<LayerUniform>()].copy_from_slice(bytemuck::bytes_of(&uniform));
-        }
-        let (buffer, _) = match self.layers.take() {
-            Some(old) if old.0.size() >= uniforms.len() as u64 => self.layers.insert(old),
-            _ => self.layers.insert(layer_group(&self.device, &self.terrain_groups[1], uniforms.len())),
-        };
-        self.queue.write_buffer(buffer, 0, &uniforms);
-
-        let instances: Vec<_> = draws
-            .iter()
-            .map(|draw| {
-                let layer = draw.item.layer;
-                let mut local = layers[layer].forest.local(draw.item.diamond);
-                if draw.kind == Kind::Corners {
-                    local.origin = draw.item.diamond.centre().map(i64::from);
-                }
-                // Steps are at most a root square's side, 2^24.
-                let [ux, uy, vx, vy] = [local.u[0], local.u[1], local.v[0], local.v[1]]
-                    .map(|step| i32::try_from(step).unwrap_or(0));
-                let moving = draw.item.moving.as_ref();
-                let (now, duration) = moving.map_or((0, 1), |m| (m.now.ticks(), m.motion.duration()));
-                Instance {
-                    origin: references[layer].relative(local.origin),
-                    axes: [ux, uy, vx, vy],
-                    level: i32::try_from(draw.item.diamond.level()).unwrap_or(0),
-                    now,
-                    duration,
-                }
-            })
-            .collect();
-        let bytes: &[u8] = bytemuck::cast_slice(&instances);
-        let buffer = match self.instances.take() {
-            Some(old) if old.size() >= bytes.len() as u64 => self.instances.insert(old),
-            _ => self.instances.insert(self.device.create_buffer(&wgpu::BufferDescriptor {
-                label: Some("instances"),
-                size: (bytes.len() as u64).next_power_of_two().max(4096),
-                usage: wgpu::BufferUsages::VERTEX | wgpu::BufferUsages::COPY_DST,
-                mapped_at_creation: false,
-            })),
-        };
-        self.queue.write_buffer(buffer, 0, bytes);
-    }
-
     /// Draws the triangles of the items, or the lines around them.
-    fn draw_terrain(
+    ///
+    /// The draws are those that `lens` was told of, from the one with this number on.
+    #[allow(clippy::too_many_arguments, reason = "a pass is told by so many things, each of its own type")]
+    fn draw_surfaces(
         &self,
         pass: &mut wgpu::RenderPass<'_>,
+        lens: &Lens,
         draws: &[Draw<'_>],
+        first_instance: u32,
         pipelines: &Pipelines,
         lines: bool,
         stats: &mut FrameStats,
     ) {
-        let (Some((_, layer_group)), Some(instances)) = (&self.layers, &self.instances) else { return };
-        pass.set_bind_group(0, &self.frame_group, &[]);
+        let (Some((_, layer_group)), Some(instances)) = (&lens.layers, &lens.instances) else { return };
+        pass.set_bind_group(0, &lens.frame_group, &[]);
         let (mut layer_now, mut places_now, mut triangles_now) = (None, None, None::<&Triangles>);
         let mut kind_now = None;
-        for (draw, instance) in draws.iter().zip(0u32..) {
+        for (draw, instance) in draws.iter().zip(first_instance..) {
             let grid = self.residents.grid(draw.item);
             let Some(resident) = self.residents.get(draw.item) else { continue };
             let triangles = resident.own.as_ref().or(grid.map(|grid| &grid.triangles));
@@ -579,6 +434,101 @@ impl Renderer {
                 let range = if lines { 2 * range.start..2 * range.end } else { range };
                 pass.draw_indexed(range, 0, instance..instance + 1);
             }
+        }
+    }
+}
+
+impl Lens {
+    fn new(device: &wgpu::Device, groups: &[wgpu::BindGroupLayout; 2]) -> Self {
+        let frame = device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("frame"),
+            size: size_of::<FrameUniform>() as u64,
+            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        let frame_group = device.create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some("frame"),
+            layout: &groups[0],
+            entries: &[wgpu::BindGroupEntry { binding: 0, resource: frame.as_entire_binding() }],
+        });
+        Self { frame, frame_group, layers: None, instances: None }
+    }
+
+    /// Tells it all of a pass; the distance of the near plane, in metres. `encode`: see [`FrameUniform::new`].
+    fn write(
+        &mut self,
+        renderer: &Renderer,
+        layers: &[Layer],
+        view: &View,
+        look: &Look,
+        draws: &[Draw<'_>],
+        encode: bool,
+    ) -> f32 {
+        let Renderer { device, queue, groups, .. } = renderer;
+        let eye = view.eye();
+        let nearest = draws.iter().map(|d| d.distance).fold(NEAR_MAX, f64::min);
+        // A little before the nearest box: rounding must not cut it.
+        let near = single((0.9 * nearest).max(nearest_drawn(layers.iter().flat_map(|layer| layer.cell))));
+        let frame = FrameUniform::new(view, look, near, encode);
+        queue.write_buffer(&self.frame, 0, bytemuck::bytes_of(&frame));
+
+        let references: Vec<_> =
+            layers.iter().map(|layer| Reference::near(layer, eye, look.exaggeration)).collect();
+        let mut uniforms = vec![0u8; LAYER_STRIDE * layers.len().max(1)];
+        for ((layer, reference), slot) in
+            layers.iter().zip(&references).zip(uniforms.chunks_mut(LAYER_STRIDE))
+        {
+            let uniform = reference.uniform(layer, eye, look);
+            slot[..size_of::<LayerUniform>()].copy_from_slice(bytemuck::bytes_of(&uniform));
+        }
+        let (buffer, _) = match self.layers.take() {
+            Some(old) if old.0.size() >= uniforms.len() as u64 => self.layers.insert(old),
+            _ => self.layers.insert(layer_group(device, &groups[1], uniforms.len())),
+        };
+        queue.write_buffer(buffer, 0, &uniforms);
+
+        let instances: Vec<_> = draws
+            .iter()
+            .map(|draw| {
+                let layer = draw.item.layer;
+                let mut local = layers[layer].forest.local(draw.item.diamond);
+                if draw.kind == Kind::Corners {
+                    local.origin = draw.item.diamond.centre().map(i64::from);
+                }
+                // Steps are at most a root square's side, 2^24.
+                let [ux, uy, vx, vy] = [local.u[0], local.u[1], local.v[0], local.v[1]]
+                    .map(|step| i32::try_from(step).unwrap_or(0));
+                let moving = draw.item.moving.as_ref();
+                let (now, duration) = moving.map_or((0, 1), |m| (m.now.ticks(), m.motion.duration()));
+                Instance {
+                    origin: references[layer].relative(local.origin),
+                    axes: [ux, uy, vx, vy],
+                    level: i32::try_from(draw.item.diamond.level()).unwrap_or(0),
+                    now,
+                    duration,
+                }
+            })
+            .collect();
+        let bytes: &[u8] = bytemuck::cast_slice(&instances);
+        let buffer = match self.instances.take() {
+            Some(old) if old.size() >= bytes.len() as u64 => self.instances.insert(old),
+            _ => self.instances.insert(device.create_buffer(&wgpu::BufferDescriptor {
+                label: Some("instances"),
+                size: (bytes.len() as u64).next_power_of_two().max(4096),
+                usage: wgpu::BufferUsages::VERTEX | wgpu::BufferUsages::COPY_DST,
+                mapped_at_creation: false,
+            })),
+        };
+        queue.write_buffer(buffer, 0, bytes);
+        near
+    }
+
+    /// The sky wherever nothing was drawn, if there is one.
+    fn draw_sky(&self, pass: &mut wgpu::RenderPass<'_>, sky: &wgpu::RenderPipeline, look: &Look) {
+        if look.background == Background::Sky {
+            pass.set_pipeline(sky);
+            pass.set_bind_group(0, &self.frame_group, &[]);
+            pass.draw(0..3, 0..1);
         }
     }
 }
@@ -623,11 +573,6 @@ fn begin_pass<'a>(
     look: &Look,
     format: wgpu::TextureFormat,
 ) -> wgpu::RenderPass<'a> {
-    let clear = match look.background {
-        Background::Sky => [0.0, 0.0, 0.0, 1.0],
-        Background::Colour(colour) => colour.map(f64::from),
-    };
-    let [r, g, b] = [0, 1, 2].map(|i| if format.is_srgb() { clear[i] } else { encoded(clear[i]) });
     let (target, resolve_target) = match &attachments.colour {
         Some(samples) => (samples, Some(view)),
         None => (view, None),
@@ -639,7 +584,7 @@ fn begin_pass<'a>(
             view: target,
             depth_slice: None,
             resolve_target,
-            ops: wgpu::Operations { load: wgpu::LoadOp::Clear(wgpu::Color { r, g, b, a: clear[3] }), store },
+            ops: wgpu::Operations { load: wgpu::LoadOp::Clear(clear_colour(look, format)), store },
         })],
         depth_stencil_attachment: Some(wgpu::RenderPassDepthStencilAttachment {
             view: &attachments.depth,
@@ -651,6 +596,16 @@ fn begin_pass<'a>(
         }),
         ..Default::default()
     })
+}
+
+/// What is seen where nothing is drawn, as a target of this format takes it.
+fn clear_colour(look: &Look, format: wgpu::TextureFormat) -> wgpu::Color {
+    let clear = match look.background {
+        Background::Sky => [0.0, 0.0, 0.0, 1.0],
+        Background::Colour(colour) => colour.map(f64::from),
+    };
+    let [r, g, b] = [0, 1, 2].map(|i| if format.is_srgb() { clear[i] } else { encoded(clear[i]) });
+    wgpu::Color { r, g, b, a: clear[3] }
 }
 
 /// The sRGB curve, for a clear colour on a target that stores colours as they are.
@@ -682,136 +637,4 @@ fn layer_group(
         }],
     });
     (buffer, group)
-}
-
-/// What the vertex shaders take of each buffer: see `shaders/terrain.wgsl`.
-const PLACE: &[wgpu::VertexAttribute] = &wgpu::vertex_attr_array![0 => Uint16x2];
-const POINT: &[wgpu::VertexAttribute] = &wgpu::vertex_attr_array![1 => Sint32, 2 => Snorm16x2];
-const INSTANCE: &[wgpu::VertexAttribute] =
-    &wgpu::vertex_attr_array![3 => Sint32x2, 4 => Sint32x4, 5 => Sint32x3];
-const RECORD: &[wgpu::VertexAttribute] =
-    &wgpu::vertex_attr_array![6 => Float32x2, 7 => Snorm16x2, 8 => Snorm16x2, 9 => Sint32];
-
-const CORNER: &[wgpu::VertexAttribute] =
-    &wgpu::vertex_attr_array![0 => Sint32x2, 1 => Sint32, 2 => Snorm16x2];
-
-/// The pipelines of diamonds that stand still, of those that move, and of irregular triangles: in the order of [`Kind`].
-fn terrain_pipelines(
-    device: &wgpu::Device,
-    options: &Options,
-    groups: &[wgpu::BindGroupLayout; 2],
-    mode: Mode,
-) -> Pipelines {
-    let layout = |stride: usize, step_mode, attributes| {
-        Some(wgpu::VertexBufferLayout { array_stride: stride as u64, step_mode, attributes })
-    };
-    let (vertex, instance) = (wgpu::VertexStepMode::Vertex, wgpu::VertexStepMode::Instance);
-    let points = [
-        layout(4, vertex, PLACE),
-        layout(size_of::<SurfacePoint>(), vertex, POINT),
-        layout(size_of::<Instance>(), instance, INSTANCE),
-        layout(size_of::<Record>(), vertex, RECORD),
-    ];
-    let corners =
-        [layout(size_of::<Corner>(), vertex, CORNER), layout(size_of::<Instance>(), instance, INSTANCE)];
-    let fragment = if mode == Mode::Lines { "wire_fragment" } else { "terrain_fragment" };
-    let groups = groups.each_ref().map(Some);
-    // Both faces are drawn: terrain seen from below is terrain still.
-    let made = |vertex, buffers: &[_]| {
-        let compare = match mode {
-            Mode::Lines => wgpu::CompareFunction::GreaterEqual,
-            Mode::Filled | Mode::Behind => wgpu::CompareFunction::Greater,
-        };
-        let depth = Depth { compare, write: true, behind: mode == Mode::Behind };
-        let topology = match mode {
-            Mode::Lines => wgpu::PrimitiveTopology::LineList,
-            Mode::Filled | Mode::Behind => wgpu::PrimitiveTopology::TriangleList,
-        };
-        pipeline(device, options, &groups, [vertex, fragment], TERRAIN_WGSL, buffers, depth, topology)
-    };
-    [
-        made("terrain_vertex", &points[..3]),
-        made("terrain_morph_vertex", &points),
-        made("tin_vertex", &corners),
-    ]
-}
-
-/// What a pipeline does with depth.
-#[derive(Debug, Clone, Copy)]
-struct Depth {
-    compare: wgpu::CompareFunction,
-    write: bool,
-    /// Whether to move triangles away by a few steps of depth, and more where they are steep.
-    behind: bool,
-}
-
-fn sky_pipeline(
-    device: &wgpu::Device,
-    options: &Options,
-    groups: &[Option<&wgpu::BindGroupLayout>],
-) -> wgpu::RenderPipeline {
-    // Infinitely far, so equal to the cleared depth and behind all else.
-    let entries = ["sky_vertex", "sky_fragment"];
-    let depth = Depth { compare: wgpu::CompareFunction::GreaterEqual, write: false, behind: false };
-    let topology = wgpu::PrimitiveTopology::TriangleList;
-    pipeline(device, options, groups, entries, SKY_WGSL, &[], depth, topology)
-}
-
-/// A pipeline with these entry points of a vertex and a fragment shader.
-#[allow(clippy::too_many_arguments, reason = "a pipeline is made of so many things, each of its own type")]
-fn pipeline(
-    device: &wgpu::Device,
-    options: &Options,
-    groups: &[Option<&wgpu::BindGroupLayout>],
-    [vertex, fragment]: [&str; 2],
-    source: &str,
-    buffers: &[Option<wgpu::VertexBufferLayout<'_>>],
-    depth: Depth,
-    topology: wgpu::PrimitiveTopology,
-) -> wgpu::RenderPipeline {
-    let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
-        label: Some(vertex),
-        source: wgpu::ShaderSource::Wgsl(source.into()),
-    });
-    let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-        label: Some(vertex),
-        bind_group_layouts: groups,
-        immediate_size: 0,
-    });
-    device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
-        label: Some(vertex),
-        layout: Some(&layout),
-        vertex: wgpu::VertexState {
-            module: &module,
-            entry_point: Some(vertex),
-            compilation_options: wgpu::PipelineCompilationOptions::default(),
-            buffers,
-        },
-        primitive: wgpu::PrimitiveState { topology, ..Default::default() },
-        depth_stencil: Some(wgpu::DepthStencilState {
-            format: DEPTH,
-            depth_write_enabled: Some(depth.write),
-            depth_compare: Some(depth.compare),
-            stencil: wgpu::StencilState::default(),
-            // Depth is reversed: less is farther away.
-            bias: if depth.behind {
-                wgpu::DepthBiasState { constant: -8, slope_scale: -1.0, clamp: 0.0 }
-            } else {
-                wgpu::DepthBiasState::default()
-            },
-        }),
-        multisample: wgpu::MultisampleState { count: options.samples, ..Default::default() },
-        fragment: Some(wgpu::FragmentState {
-            module: &module,
-            entry_point: Some(fragment),
-            compilation_options: wgpu::PipelineCompilationOptions::default(),
-            targets: &[Some(wgpu::ColorTargetState {
-                format: options.format,
-                blend: None,
-                write_mask: wgpu::ColorWrites::ALL,
-            })],
-        }),
-        multiview_mask: None,
-        cache: None,
-    })
 }

@@ -59,6 +59,15 @@ impl Offscreen {
         Ok(self.renderer.draw(layers, camera, items, look, &view))
     }
 
+    /// Waits until the GPU is done with all that was drawn.
+    ///
+    /// # Errors
+    /// When the device was lost.
+    pub fn wait(&self) -> Result<(), RenderError> {
+        let done = self.renderer.device().poll(wgpu::PollType::wait_indefinitely());
+        done.map(|_| ()).map_err(|e| RenderError::Read(e.to_string()))
+    }
+
     /// The picture last drawn, once the GPU is done with it; an empty one before the first.
     ///
     /// # Errors

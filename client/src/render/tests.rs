@@ -8,7 +8,9 @@
 )]
 
 mod motion;
+mod water;
 
+use super::pipelines::RECORD;
 use super::*;
 use crate::camera::FOV_Y;
 use crate::drawing::Moving;
@@ -20,9 +22,10 @@ use crate::world::{Dice, Ground};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::{Block, Diamond};
-use diamantina_protocol::message::Kind;
+use diamantina_protocol::message::{Kind, Scene};
 use diamantina_protocol::points::{self, Coding, Rule};
 use diamantina_protocol::tin::{self, Patch};
+use glam::DVec3;
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
@@ -37,6 +40,14 @@ const PLAIN: Look = Look {
     exaggeration: 1.0,
     show_levels: false,
     wireframe: false,
+    water: Water {
+        reflecting: true,
+        refractive_index: 1.33,
+        waves: 0.0,
+        seconds: 0.0,
+        clarity: None,
+        mirror_scale: 1.0,
+    },
 };
 
 /// A layer with all surfaces of its forest, decoded from payloads as a client does.

@@ -25,6 +25,7 @@ use crate::overview;
 use crate::pick::{Hit, Picker, Ray};
 use crate::render::{FrameStats, Look};
 use crate::terrain::{FrameView, Terrain};
+use diamantina_protocol::message::Kind;
 use egui::{Event, Key, Modifiers, PointerButton, Sense, Ui};
 use glam::{DVec2, DVec3};
 use panel::History;
@@ -225,9 +226,21 @@ impl Viewer {
         }
         self.frame = self.terrain.frame(self.controls.camera());
         self.history.note(seconds, &self.frame);
-        if !self.frame.complete || self.frame.moving > 0 || self.controls.is_gliding() {
+        let has_waves = self.has_waves();
+        if has_waves {
+            self.look.water.seconds += seconds;
+        }
+        if !self.frame.complete || self.frame.moving > 0 || self.controls.is_gliding() || has_waves {
             ui.ctx().request_repaint();
         }
+    }
+
+    /// Whether there is water in view whose waves move.
+    fn has_waves(&self) -> bool {
+        let water = &self.look.water;
+        let layers = &self.terrain.scene().layers;
+        let is_water = |item: &DrawItem| layers[item.layer].kind == Kind::Water && self.visible[item.layer];
+        water.reflecting && water.waves > 0.0 && !self.look.wireframe && self.frame.items.iter().any(is_water)
     }
 
     /// Metres of the finest layer's cells.

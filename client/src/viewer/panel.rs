@@ -3,6 +3,7 @@
 use super::{Ask, Mark, Viewer};
 use crate::render::{Background, Colours};
 use crate::terrain::FrameView;
+use diamantina_protocol::message::Kind;
 use egui::{Color32, ComboBox, Frame, Panel, RichText, ScrollArea, Slider, Stroke, Ui};
 use std::collections::VecDeque;
 
@@ -55,6 +56,7 @@ pub(super) fn show(viewer: &mut Viewer, ui: &mut Ui) {
             scene(viewer, ui);
             view(viewer, ui);
             light(viewer, ui);
+            water(viewer, ui);
             marks(viewer, ui);
             figures(viewer, ui);
             keys(ui);
@@ -124,6 +126,29 @@ fn view(viewer: &mut Viewer, ui: &mut Ui) {
     if ui.checkbox(&mut is_frozen, "freeze what is drawn").changed() {
         viewer.frozen = is_frozen.then(|| viewer.frame.items.clone());
     }
+}
+
+/// Only where there is any.
+fn water(viewer: &mut Viewer, ui: &mut Ui) {
+    if !viewer.terrain.scene().layers.iter().any(|layer| layer.kind == Kind::Water) {
+        return;
+    }
+    heading(ui, "Water");
+    let water = &mut viewer.look.water;
+    ui.checkbox(&mut water.reflecting, "mirrors, and shows its bed");
+    ui.add_enabled_ui(water.reflecting, |ui| {
+        ui.add(Slider::new(&mut water.waves, 0.0..=3.0).text("waves"));
+        let mut clarity = water.clarity.unwrap_or_default();
+        let told = if water.clarity.is_some() { "clear to [m]" } else { "clear as fits" };
+        let slider = Slider::new(&mut clarity, 0.0..=100.0).logarithmic(true).smallest_positive(0.01);
+        if ui
+            .add(slider.text(told))
+            .on_hover_text("a third of the light comes down so deep; 0: as fits")
+            .changed()
+        {
+            water.clarity = (clarity > 0.0).then_some(clarity);
+        }
+    });
 }
 
 fn light(viewer: &mut Viewer, ui: &mut Ui) {

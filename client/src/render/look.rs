@@ -1,0 +1,144 @@
+//! How a frame looks: light, colours, water.
+
+use diamantina_protocol::message::Scene;
+use glam::DVec3;
+
+/// How a frame looks.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Look {
+    /// What is seen where no terrain is.
+    pub background: Background,
+    /// Where the light comes from.
+    pub sun: Sun,
+    /// What terrain is coloured by.
+    pub colours: Colours,
+    /// The thickness of the air: 0 is none, 1 a clear day.
+    pub haze: f32,
+    /// What heights are multiplied by; above 0. The camera's positions count in stretched heights.
+    pub exaggeration: f64,
+    /// Whether to tint diamonds by level.
+    pub show_levels: bool,
+    /// Whether to draw the sides of triangles.
+    pub wireframe: bool,
+    /// How water looks.
+    pub water: Water,
+}
+
+impl Default for Look {
+    fn default() -> Self {
+        Self {
+            background: Background::Sky,
+            sun: Sun::default(),
+            colours: Colours::Auto,
+            haze: 1.0,
+            exaggeration: 1.0,
+            show_levels: false,
+            wireframe: false,
+            water: Water::default(),
+        }
+    }
+}
+
+impl Look {
+    /// How a scene looks unless told otherwise: other bodies than the Earth are grey, without air, and the sun
+    /// stands low, as plains of dust show little relief else.
+    #[must_use]
+    pub fn of(scene: &Scene) -> Self {
+        let radius = scene.frame.crs.as_ref().and_then(|crs| crs.proj4.as_deref()).and_then(radius);
+        if radius.is_none_or(|metres| (metres - EARTH_RADIUS).abs() < 100_000.0) {
+            return Self::default();
+        }
+        let black = Background::Colour([0.003, 0.003, 0.004, 1.0]);
+        let sun = Sun { altitude_degrees: 20.0, ..Sun::default() };
+        Self { background: black, sun, colours: Colours::Grey, haze: 0.0, ..Self::default() }
+    }
+}
+
+/// Metres from the Earth's centre, give or take 20 km.
+const EARTH_RADIUS: f64 = 6_371_000.0;
+
+/// The radius that a PROJ string names by number, in metres.
+fn radius(proj4: &str) -> Option<f64> {
+    proj4.split_whitespace().find_map(|w| w.strip_prefix("+R=").or(w.strip_prefix("+a=")))?.parse().ok()
+}
+
+/// What is seen where no terrain is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Background {
+    /// A gradient from the horizon to overhead.
+    Sky,
+    /// One colour: linear red, green, blue and alpha.
+    Colour([f32; 4]),
+}
+
+/// The direction to the sun.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sun {
+    /// Degrees from north, clockwise.
+    pub azimuth_degrees: f64,
+    /// Degrees above the horizon.
+    pub altitude_degrees: f64,
+}
+
+impl Default for Sun {
+    /// North-west and half way up: the custom of maps, which makes valleys look like valleys.
+    fn default() -> Self {
+        Self { azimuth_degrees: 315.0, altitude_degrees: 45.0 }
+    }
+}
+
+impl Sun {
+    /// The unit vector towards the sun: x east, y north, z up.
+    #[must_use]
+    pub fn direction(self) -> DVec3 {
+        let (azimuth, altitude) = (self.azimuth_degrees.to_radians(), self.altitude_degrees.to_radians());
+        DVec3::new(azimuth.sin() * altitude.cos(), azimuth.cos() * altitude.cos(), altitude.sin())
+    }
+}
+
+/// What terrain is coloured by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Colours {
+    /// As `Bathymetry` for layers a good part of whose range is below 0 m, as `Terrain` for others: lowlands
+    /// and noise around 0 m are no sea.
+    Auto,
+    /// Height, over the layer's range.
+    Terrain,
+    /// Height, and depth below 0 m.
+    Bathymetry,
+    /// Height, from dark to light grey: for bodies without plants and water.
+    Grey,
+    /// Nothing: one grey.
+    Flat,
+}
+
+/// How layers of water look.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Water {
+    /// Whether it mirrors what is around it and shows what is below it; else it is one opaque colour.
+    pub reflecting: bool,
+    /// How much slower light is in it than in the air: 1.33. Above 1; a very large number makes a mirror.
+    pub refractive_index: f64,
+    /// How high waves are: 0 is a mirror, 1 a breeze.
+    pub waves: f64,
+    /// The moment of the waves, in seconds.
+    pub seconds: f64,
+    /// The depth in metres through which 1/e of green light comes; else one that fits the layer's extent.
+    pub clarity: Option<f64>,
+    /// Width and height of the mirrored picture as parts of those of the picture; above 0, at most 1.
+    pub mirror_scale: f64,
+}
+
+impl Default for Water {
+    /// A lake in a breeze.
+    fn default() -> Self {
+        Self {
+            reflecting: true,
+            refractive_index: 1.33,
+            waves: 1.0,
+            seconds: 0.0,
+            clarity: None,
+            mirror_scale: 1.0,
+        }
+    }
+}

@@ -1,0 +1,191 @@
+//! Pipelines: how vertices of each kind become pixels of each pass.
+
+use super::resident::SurfacePoint;
+use super::{DEPTH, Instance};
+use crate::morph::Record;
+use crate::surface::Corner;
+
+/// The shaders of terrain: what becomes of heights, and what colour that has.
+pub(super) const TERRAIN_WGSL: &str = concat!(
+    include_str!("../../../shaders/frame.wgsl"),
+    include_str!("../../../shaders/surface.wgsl"),
+    include_str!("../../../shaders/terrain.wgsl")
+);
+/// The shaders of water: its surface is one like that of terrain.
+pub(super) const WATER_WGSL: &str = concat!(
+    include_str!("../../../shaders/frame.wgsl"),
+    include_str!("../../../shaders/surface.wgsl"),
+    include_str!("../../../shaders/water.wgsl")
+);
+/// The shaders of the sky.
+pub(super) const SKY_WGSL: &str =
+    concat!(include_str!("../../../shaders/frame.wgsl"), include_str!("../../../shaders/sky.wgsl"));
+
+/// What a diamond's vertices are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Kind {
+    Points,
+    MovingPoints,
+    Corners,
+}
+
+/// How triangles are drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Mode {
+    Filled,
+    /// A little farther away than they are, so that lines along their sides are seen.
+    Behind,
+    Lines,
+    /// Only what is above the mirror.
+    Mirrored,
+    /// As water, which takes a third group.
+    Water,
+}
+
+/// What a pass draws to.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Target {
+    pub(super) format: wgpu::TextureFormat,
+    /// Samples a pixel.
+    pub(super) samples: u32,
+}
+
+/// A pipeline for each kind.
+pub(super) type Pipelines = [wgpu::RenderPipeline; 3];
+
+/// What the vertex shaders take of each buffer: see `shaders/terrain.wgsl`.
+const PLACE: &[wgpu::VertexAttribute] = &wgpu::vertex_attr_array![0 => Uint16x2];
+const POINT: &[wgpu::VertexAttribute] = &wgpu::vertex_attr_array![1 => Sint32, 2 => Snorm16x2];
+const INSTANCE: &[wgpu::VertexAttribute] =
+    &wgpu::vertex_attr_array![3 => Sint32x2, 4 => Sint32x4, 5 => Sint32x3];
+pub(super) const RECORD: &[wgpu::VertexAttribute] =
+    &wgpu::vertex_attr_array![6 => Float32x2, 7 => Snorm16x2, 8 => Snorm16x2, 9 => Sint32];
+
+const CORNER: &[wgpu::VertexAttribute] =
+    &wgpu::vertex_attr_array![0 => Sint32x2, 1 => Sint32, 2 => Snorm16x2];
+
+/// The pipelines of diamonds that stand still, of those that move, and of irregular triangles: in the order of [`Kind`].
+pub(super) fn terrain_pipelines(
+    device: &wgpu::Device,
+    target: Target,
+    groups: &[&wgpu::BindGroupLayout],
+    mode: Mode,
+) -> Pipelines {
+    let layout = |stride: usize, step_mode, attributes| {
+        Some(wgpu::VertexBufferLayout { array_stride: stride as u64, step_mode, attributes })
+    };
+    let (vertex, instance) = (wgpu::VertexStepMode::Vertex, wgpu::VertexStepMode::Instance);
+    let points = [
+        layout(4, vertex, PLACE),
+        layout(size_of::<SurfacePoint>(), vertex, POINT),
+        layout(size_of::<Instance>(), instance, INSTANCE),
+        layout(size_of::<Record>(), vertex, RECORD),
+    ];
+    let corners =
+        [layout(size_of::<Corner>(), vertex, CORNER), layout(size_of::<Instance>(), instance, INSTANCE)];
+    let (source, fragment) = match mode {
+        Mode::Filled | Mode::Behind => (TERRAIN_WGSL, "terrain_fragment"),
+        Mode::Lines => (TERRAIN_WGSL, "wire_fragment"),
+        Mode::Mirrored => (TERRAIN_WGSL, "mirrored_fragment"),
+        Mode::Water => (WATER_WGSL, "water_fragment"),
+    };
+    let groups: Vec<_> = groups.iter().map(|group| Some(*group)).collect();
+    // Both faces are drawn: terrain seen from below is terrain still.
+    let made = |vertex, buffers: &[_]| {
+        let compare = match mode {
+            Mode::Lines => wgpu::CompareFunction::GreaterEqual,
+            _ => wgpu::CompareFunction::Greater,
+        };
+        let depth = Depth { compare, write: true, behind: mode == Mode::Behind };
+        let topology = match mode {
+            Mode::Lines => wgpu::PrimitiveTopology::LineList,
+            _ => wgpu::PrimitiveTopology::TriangleList,
+        };
+        pipeline(device, target, &groups, [vertex, fragment], source, buffers, depth, topology)
+    };
+    [
+        made("terrain_vertex", &points[..3]),
+        made("terrain_morph_vertex", &points),
+        made("tin_vertex", &corners),
+    ]
+}
+
+/// What a pipeline does with depth.
+#[derive(Debug, Clone, Copy)]
+struct Depth {
+    compare: wgpu::CompareFunction,
+    write: bool,
+    /// Whether to move triangles away by a few steps of depth, and more where they are steep.
+    behind: bool,
+}
+
+pub(super) fn sky_pipeline(
+    device: &wgpu::Device,
+    target: Target,
+    frame: &wgpu::BindGroupLayout,
+) -> wgpu::RenderPipeline {
+    // Infinitely far, so equal to the cleared depth and behind all else.
+    let entries = ["sky_vertex", "sky_fragment"];
+    let depth = Depth { compare: wgpu::CompareFunction::GreaterEqual, write: false, behind: false };
+    let topology = wgpu::PrimitiveTopology::TriangleList;
+    pipeline(device, target, &[Some(frame)], entries, SKY_WGSL, &[], depth, topology)
+}
+
+/// A pipeline with these entry points of a vertex and a fragment shader.
+#[allow(clippy::too_many_arguments, reason = "a pipeline is made of so many things, each of its own type")]
+fn pipeline(
+    device: &wgpu::Device,
+    target: Target,
+    groups: &[Option<&wgpu::BindGroupLayout>],
+    [vertex, fragment]: [&str; 2],
+    source: &str,
+    buffers: &[Option<wgpu::VertexBufferLayout<'_>>],
+    depth: Depth,
+    topology: wgpu::PrimitiveTopology,
+) -> wgpu::RenderPipeline {
+    let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+        label: Some(vertex),
+        source: wgpu::ShaderSource::Wgsl(source.into()),
+    });
+    let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+        label: Some(vertex),
+        bind_group_layouts: groups,
+        immediate_size: 0,
+    });
+    device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
+        label: Some(vertex),
+        layout: Some(&layout),
+        vertex: wgpu::VertexState {
+            module: &module,
+            entry_point: Some(vertex),
+            compilation_options: wgpu::PipelineCompilationOptions::default(),
+            buffers,
+        },
+        primitive: wgpu::PrimitiveState { topology, ..Default::default() },
+        depth_stencil: Some(wgpu::DepthStencilState {
+            format: DEPTH,
+            depth_write_enabled: Some(depth.write),
+            depth_compare: Some(depth.compare),
+            stencil: wgpu::StencilState::default(),
+            // Depth is reversed: less is farther away.
+            bias: if depth.behind {
+                wgpu::DepthBiasState { constant: -8, slope_scale: -1.0, clamp: 0.0 }
+            } else {
+                wgpu::DepthBiasState::default()
+            },
+        }),
+        multisample: wgpu::MultisampleState { count: target.samples, ..Default::default() },
+        fragment: Some(wgpu::FragmentState {
+            module: &module,
+            entry_point: Some(fragment),
+            compilation_options: wgpu::PipelineCompilationOptions::default(),
+            targets: &[Some(wgpu::ColorTargetState {
+                format: target.format,
+                blend: None,
+                write_mask: wgpu::ColorWrites::ALL,
+            })],
+        }),
+        multiview_mask: None,
+        cache: None,
+    })
+}

@@ -1,0 +1,371 @@
+//! Water, in passes before the picture's own: what is mirrored, and what is seen through it.
+//!
+//! After the projective texture mapping of the water of BDAM terrain: (a) the scene without water, mirrored in the
+//! surface's mean plane and clipped there, and the same scene from the eye itself, each into a texture; (b), (c) both are
+//! projected onto the surface by the place on the screen; (d) each pixel mixes them by its Fresnel reflectance, here with
+//! Schlick's R(t) = R0 + (1 - R0) (1 - cos t)^5 and R0 = ((n - 1) / (n + 1))^2. See `shaders/water.wgsl`.
+//!
+//! Each layer of water has one plane, at the mean height of what is in view of it, near parts counting most. Its own
+//! slopes and the waves bend the rays at each pixel. The mirrored picture is drawn from the same diamonds as the picture:
+//! what is out of the picture's view is coarser than its mirror image would ask for.
+
+use super::frame::single;
+use super::pipelines::{Mode, Pipelines, Target, sky_pipeline, terrain_pipelines};
+use super::view::View;
+use super::{DEPTH, Draw, FrameStats, Lens, Look, Renderer, clear_colour};
+use crate::camera::Camera;
+use crate::drawing::DrawItem;
+use diamantina_protocol::message::Layer;
+use glam::{DVec2, DVec3};
+use std::collections::BTreeMap;
+
+/// What textures between passes hold: colours, linear when read.
+const TARGET: Target = Target { format: wgpu::TextureFormat::Rgba8UnormSrgb, samples: 1 };
+
+/// Waves that are added up; the twin of a number in `shaders/water.wgsl`.
+const WAVES: usize = 10;
+
+/// Metres a second each second.
+const GRAVITY: f64 = 9.81;
+
+/// What a metre takes of red, green and blue, in parts of what it takes of green: clear lakes are blue-green.
+const ABSORPTION: [f64; 3] = [4.0, 1.0, 0.75];
+
+/// What deep water sends back of red, green and blue.
+const BODY: [f32; 3] = [0.008, 0.045, 0.065];
+
+/// The twin of `Water` in `shaders/water.wgsl`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+pub(super) struct WaterUniform {
+    pub(super) absorption: [f32; 4],
+    pub(super) body: [f32; 4],
+    pub(super) optics: [f32; 4],
+    pub(super) waves: [[f32; 4]; WAVES],
+}
+
+impl WaterUniform {
+    /// `near`: the near plane of the picture of what is seen through, in metres.
+    fn new(layer: &Layer, look: &Look, eye: DVec3, near: f32) -> Self {
+        let water = &look.water;
+        let extent = [0, 1].map(|i| layer.cell[i] * f64::from(layer.samples[i]));
+        let extent = extent[0].hypot(extent[1]);
+        // Deep enough for a lake's bed to be seen at its shore, down to a tank's in a laboratory.
+        let clarity = water.clarity.unwrap_or_else(|| (extent / 2000.0).clamp(0.05, 12.0));
+        let [r, g, b] = ABSORPTION.map(|part| single(part / clarity / look.exaggeration));
+        let index = water.refractive_index;
+        let straight_down = ((index - 1.0) / (index + 1.0)).powi(2);
+        let longest = (extent / 100.0).clamp(0.02, 60.0);
+        Self {
+            absorption: [r, g, b, single(clarity * look.exaggeration / 50.0)],
+            body: [BODY[0], BODY[1], BODY[2], 0.0],
+            optics: [
+                single(straight_down),
+                single(1.0 / index),
+                near,
+                if water.waves > 0.0 { 1.0 } else { 0.0 },
+            ],
+            waves: waves(longest, water.waves, water.seconds, eye.truncate()),
+        }
+    }
+}
+
+/// Waves from the longest in metres on down, about a wind from the north-west. Phases are told at the eye, so that they are
+/// exact however far it is from the origin.
+fn waves(longest: f64, strength: f64, seconds: f64, eye: DVec2) -> [[f32; 4]; WAVES] {
+    std::array::from_fn(|i| {
+        let part = i as f64;
+        let turn = std::f64::consts::TAU / (longest * 0.68f64.powf(part));
+        // Spread as evenly as may be without repeating: by the golden ratio.
+        let spread = ((part + 1.0) * 0.618_034).fract() * 2.0 - 1.0;
+        let direction = DVec2::from_angle(-0.8 + 1.3 * spread);
+        // Deep water: the square of the speed grows with the length.
+        let phase = turn * direction.dot(eye) - (GRAVITY * turn).sqrt() * seconds + 1.7 * part;
+        let vector = direction * turn;
+        let slope = 0.02 * strength;
+        [single(vector.x), single(vector.y), single(phase.rem_euclid(std::f64::consts::TAU)), single(slope)]
+    })
+}
+
+/// A picture between two passes.
+struct Sheet {
+    size: [u32; 2],
+    colour: wgpu::TextureView,
+    depth: wgpu::TextureView,
+}
+
+impl Sheet {
+    fn new(device: &wgpu::Device, label: &str, size: [u32; 2]) -> Self {
+        let view = |format| {
+            let [width, height] = size;
+            let texture = device.create_texture(&wgpu::TextureDescriptor {
+                label: Some(label),
+                size: wgpu::Extent3d { width, height, depth_or_array_layers: 1 },
+                mip_level_count: 1,
+                sample_count: 1,
+                dimension: wgpu::TextureDimension::D2,
+                format,
+                usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::TEXTURE_BINDING,
+                view_formats: &[],
+            });
+            texture.create_view(&wgpu::TextureViewDescriptor::default())
+        };
+        Self { size, colour: view(TARGET.format), depth: view(DEPTH) }
+    }
+}
+
+/// What a layer of water mirrors.
+struct Mirror {
+    sheet: Sheet,
+    lens: Lens,
+    uniform: wgpu::Buffer,
+    group: wgpu::BindGroup,
+}
+
+/// All that water takes, made when it is first seen.
+pub(super) struct WaterPasses {
+    layout: wgpu::BindGroupLayout,
+    sampler: wgpu::Sampler,
+    /// To the picture.
+    surfaces: Pipelines,
+    /// To the textures: what is mirrored, what is seen through, and the sky.
+    mirrored: Pipelines,
+    through: Pipelines,
+    sky: wgpu::RenderPipeline,
+    scene: Sheet,
+    scene_lens: Lens,
+    /// By layer.
+    mirrors: BTreeMap<usize, Mirror>,
+}
+
+impl WaterPasses {
+    pub(super) fn new(renderer: &Renderer, size: [u32; 2]) -> Self {
+        let device = &renderer.device;
+        let texture = |binding, filterable| wgpu::BindGroupLayoutEntry {
+            binding,
+            visibility: wgpu::ShaderStages::FRAGMENT,
+            ty: wgpu::BindingType::Texture {
+                sample_type: wgpu::TextureSampleType::Float { filterable },
+                view_dimension: wgpu::TextureViewDimension::D2,
+                multisampled: false,
+            },
+            count: None,
+        };
+        let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+            label: Some("water"),
+            entries: &[
+                wgpu::BindGroupLayoutEntry {
+                    binding: 0,
+                    visibility: wgpu::ShaderStages::FRAGMENT,
+                    ty: wgpu::BindingType::Buffer {
+                        ty: wgpu::BufferBindingType::Uniform,
+                        has_dynamic_offset: false,
+                        min_binding_size: wgpu::BufferSize::new(size_of::<WaterUniform>() as u64),
+                    },
+                    count: None,
+                },
+                wgpu::BindGroupLayoutEntry {
+                    binding: 1,
+                    visibility: wgpu::ShaderStages::FRAGMENT,
+                    ty: wgpu::BindingType::Sampler(wgpu::SamplerBindingType::Filtering),
+                    count: None,
+                },
+                texture(2, true),
+                texture(3, true),
+                texture(4, false),
+            ],
+        });
+        let sampler = device.create_sampler(&wgpu::SamplerDescriptor {
+            label: Some("water"),
+            mag_filter: wgpu::FilterMode::Linear,
+            min_filter: wgpu::FilterMode::Linear,
+            ..Default::default()
+        });
+        let [frame, layer] = &renderer.groups;
+        let terrain = |mode| terrain_pipelines(device, TARGET, &[frame, layer], mode);
+        Self {
+            surfaces: terrain_pipelines(device, renderer.target(), &[frame, layer, &layout], Mode::Water),
+            mirrored: terrain(Mode::Mirrored),
+            through: terrain(Mode::Filled),
+            sky: sky_pipeline(device, TARGET, frame),
+            scene: Sheet::new(device, "seen through water", size),
+            scene_lens: Lens::new(device, &renderer.groups),
+            mirrors: BTreeMap::new(),
+            layout,
+            sampler,
+        }
+    }
+
+    /// Draws what the layers of water in view mirror, and what is seen through them. `water` is sorted by layer.
+    #[allow(clippy::too_many_arguments, reason = "a frame is told by so many things, each of its own type")]
+    pub(super) fn prepare(
+        &mut self,
+        renderer: &Renderer,
+        encoder: &mut wgpu::CommandEncoder,
+        layers: &[Layer],
+        camera: &Camera,
+        items: &[DrawItem],
+        look: &Look,
+        water: &[Draw<'_>],
+        stats: &mut FrameStats,
+    ) {
+        let device = &renderer.device;
+        if self.scene.size != camera.size {
+            self.scene = Sheet::new(device, "seen through water", camera.size);
+            self.mirrors.clear();
+        }
+        let is_land = |item: &DrawItem| !renderer.is_water(layers, item, look);
+        // Haze lies before the surface, not before the bed: the surface's own pixels add it.
+        let clear = Look { haze: 0.0, ..*look };
+        let view = View::straight(camera);
+        let land = renderer.in_view(layers, &view, items, look, is_land);
+        let near = self.scene_lens.write(renderer, layers, &view, &clear, &land, false);
+        draw_sheet(
+            renderer,
+            encoder,
+            &self.scene,
+            &self.scene_lens,
+            look,
+            &land,
+            &self.through,
+            &self.sky,
+            stats,
+        );
+
+        let scale = look.water.mirror_scale.clamp(1e-3, 1.0);
+        #[allow(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "at most as large as it was"
+        )]
+        let size = camera.size.map(|pixels| ((f64::from(pixels) * scale).round() as u32).max(1));
+        let mut of_layer: BTreeMap<usize, Vec<&Draw<'_>>> = BTreeMap::new();
+        for draw in water {
+            of_layer.entry(draw.item.layer).or_default().push(draw);
+        }
+        for (number, draws) in of_layer {
+            let layer = &layers[number];
+            if self.mirrors.get(&number).is_none_or(|mirror| mirror.sheet.size != size) {
+                let mirror = self.mirror(renderer, size);
+                self.mirrors.insert(number, mirror);
+            }
+            let Some(mirror) = self.mirrors.get_mut(&number) else { continue };
+            let uniform = WaterUniform::new(layer, look, camera.eye, near);
+            renderer.queue.write_buffer(&mirror.uniform, 0, bytemuck::bytes_of(&uniform));
+            let height = mean_height(&draws, camera.eye);
+            if camera.eye.z <= height {
+                // Nothing is mirrored on the way up.
+                continue;
+            }
+            let view = View::mirrored(camera, height);
+            let land = renderer.in_view(layers, &view, items, look, is_land);
+            mirror.lens.write(renderer, layers, &view, look, &land, false);
+            draw_sheet(
+                renderer,
+                encoder,
+                &mirror.sheet,
+                &mirror.lens,
+                look,
+                &land,
+                &self.mirrored,
+                &self.sky,
+                stats,
+            );
+        }
+    }
+
+    fn mirror(&self, renderer: &Renderer, size: [u32; 2]) -> Mirror {
+        let device = &renderer.device;
+        let sheet = Sheet::new(device, "mirrored", size);
+        let uniform = device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("water"),
+            size: size_of::<WaterUniform>() as u64,
+            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        let view = |binding, view| wgpu::BindGroupEntry {
+            binding,
+            resource: wgpu::BindingResource::TextureView(view),
+        };
+        let group = device.create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some("water"),
+            layout: &self.layout,
+            entries: &[
+                wgpu::BindGroupEntry { binding: 0, resource: uniform.as_entire_binding() },
+                wgpu::BindGroupEntry { binding: 1, resource: wgpu::BindingResource::Sampler(&self.sampler) },
+                view(2, &sheet.colour),
+                view(3, &self.scene.colour),
+                view(4, &self.scene.depth),
+            ],
+        });
+        Mirror { lens: Lens::new(device, &renderer.groups), sheet, uniform, group }
+    }
+
+    /// Draws the surfaces themselves, in the picture's pass.
+    pub(super) fn draw(
+        &self,
+        renderer: &Renderer,
+        pass: &mut wgpu::RenderPass<'_>,
+        lens: &Lens,
+        water: &[Draw<'_>],
+        first_instance: u32,
+        stats: &mut FrameStats,
+    ) {
+        let mut first = first_instance;
+        for draws in water.chunk_by(|a, b| a.item.layer == b.item.layer) {
+            if let Some(mirror) = draws.first().and_then(|draw| self.mirrors.get(&draw.item.layer)) {
+                pass.set_bind_group(2, &mirror.group, &[]);
+                renderer.draw_surfaces(pass, lens, draws, first, &self.surfaces, false, stats);
+            }
+            first += u32::try_from(draws.len()).unwrap_or(0);
+        }
+    }
+}
+
+/// One pass to a texture, with the sky behind.
+#[allow(clippy::too_many_arguments, reason = "a pass is told by so many things, each of its own type")]
+fn draw_sheet(
+    renderer: &Renderer,
+    encoder: &mut wgpu::CommandEncoder,
+    sheet: &Sheet,
+    lens: &Lens,
+    look: &Look,
+    land: &[Draw<'_>],
+    pipelines: &Pipelines,
+    sky: &wgpu::RenderPipeline,
+    stats: &mut FrameStats,
+) {
+    let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
+        label: Some("water"),
+        color_attachments: &[Some(wgpu::RenderPassColorAttachment {
+            view: &sheet.colour,
+            depth_slice: None,
+            resolve_target: None,
+            ops: wgpu::Operations {
+                load: wgpu::LoadOp::Clear(clear_colour(look, TARGET.format)),
+                store: wgpu::StoreOp::Store,
+            },
+        })],
+        depth_stencil_attachment: Some(wgpu::RenderPassDepthStencilAttachment {
+            view: &sheet.depth,
+            depth_ops: Some(wgpu::Operations { load: wgpu::LoadOp::Clear(0.0), store: wgpu::StoreOp::Store }),
+            stencil_ops: None,
+        }),
+        ..Default::default()
+    });
+    renderer.draw_surfaces(&mut pass, lens, land, 0, pipelines, false, stats);
+    lens.draw_sky(&mut pass, sky, look);
+}
+
+/// The mean height of what is in view, in metres, stretched: each part counts as large as it looks.
+fn mean_height(draws: &[&Draw<'_>], eye: DVec3) -> f64 {
+    let (mut sum, mut weights) = (0.0, 0.0);
+    for draw in draws {
+        let size = draw.bounds.max - draw.bounds.min;
+        let distance = draw.bounds.distance(eye).max(size.truncate().length()).max(1e-9);
+        let weight = (size.x * size.y).max(1e-9) / (distance * distance);
+        sum += weight * draw.bounds.min.z.midpoint(draw.bounds.max.z);
+        weights += weight;
+    }
+    sum / weights
+}

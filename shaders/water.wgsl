@@ -1,0 +1,135 @@
+// Water: what is mirrored in it and what is seen through it, mixed as Fresnel found (in Schlick's form); light that it
+// takes away on its way through (Beer and Lambert), and small waves that bend both pictures.
+//
+// Both pictures are textures as large as the screen, projected: the mirrored one is what the eye, mirrored in the mean
+// plane of the surface, sees of the scene without water; the other what the eye sees of it. Over a level surface without
+// waves each pixel takes the mirrored picture's own pixel, exactly.
+
+struct Water {
+    // rgb: what a metre of water takes away of light, as the exponent. w: metres of depth over which the shore fades in.
+    absorption: vec4<f32>,
+    // rgb: what deep water sends back of white light.
+    body: vec4<f32>,
+    // x: the part that is mirrored looking straight down. y: 1 / refractive index. z: metres of the near plane.
+    // w: how bright the sun glitters.
+    optics: vec4<f32>,
+    // Each wave: xy the wave vector, in radians a metre; z the phase at the eye; w the largest slope.
+    waves: array<vec4<f32>, 10>,
+}
+
+@group(2) @binding(0) var<uniform> water: Water;
+@group(2) @binding(1) var smooth_sampler: sampler;
+@group(2) @binding(2) var mirrored: texture_2d<f32>;
+@group(2) @binding(3) var scene: texture_2d<f32>;
+// The depth of `scene`, reversed: the near plane's distance over the distance forward.
+@group(2) @binding(4) var scene_depth: texture_2d<f32>;
+
+// Where on the screen a direction or a place, relative to the eye, is seen: x and y from 0 to 1 down and to the right,
+// and whether it is ahead at all.
+fn projected(p: vec3<f32>) -> vec3<f32> {
+    let clip = frame.clip_from_eye * vec4<f32>(p, 1.0);
+    let place = vec2<f32>(0.5, -0.5) * clip.xy / max(clip.w, 1e-12) + 0.5;
+    return vec3<f32>(place, select(0.0, 1.0, clip.w > 0.0));
+}
+
+// The slope of the waves at a place, those too small for a pixel of so many metres left out.
+fn wave_slope(across: vec2<f32>, pixel: f32) -> vec2<f32> {
+    var slope = vec2<f32>(0.0);
+    for (var i = 0; i < 10; i++) {
+        let wave = water.waves[i];
+        let turn = length(wave.xy);
+        let seen = 1.0 - smoothstep(0.6, 2.0, pixel * turn);
+        slope += wave.xy / turn * (wave.w * seen * cos(dot(wave.xy, across) + wave.z));
+    }
+    return slope;
+}
+
+// Metres from the eye to what the scene without water shows at a place of the screen, along a ray that goes `forward`
+// metres ahead a metre; a great many where that is the sky.
+fn scene_distance(place: vec2<f32>, forward: f32) -> f32 {
+    let size = vec2<i32>(textureDimensions(scene_depth));
+    let pixel = clamp(vec2<i32>(place * vec2<f32>(size)), vec2<i32>(0), size - 1);
+    let depth = textureLoad(scene_depth, pixel, 0).x;
+    return water.optics.z / max(depth, 1e-20) / forward;
+}
+
+fn ray_through(place: vec2<f32>) -> vec3<f32> {
+    let clip = vec2<f32>(2.0, -2.0) * (place - 0.5);
+    return normalize(frame.forward.xyz + clip.x * frame.right.xyz + clip.y * frame.up.xyz);
+}
+
+// How far a place is outside of the screen, in parts of it.
+fn outside(place: vec2<f32>) -> f32 {
+    let beyond = max(abs(place - 0.5) - 0.5, vec2<f32>(0.0));
+    return max(beyond.x, beyond.y);
+}
+
+@fragment
+fn water_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
+    let p = shaded.from_eye;
+    let pixel = max(length(fwidth(p.xy)), 1e-6);
+    let distance = length(p);
+    let ray = p / distance;
+    let here = shaded.clip.xy / vec2<f32>(textureDimensions(scene));
+    let ahead = dot(ray, frame.forward.xyz);
+
+    let still = normal_of(shaded);
+    let slope = wave_slope(p.xy, pixel);
+    // Waves never turn a surface away from the eye.
+    var normal = normalize(vec3<f32>(still.xy - slope * still.z, still.z));
+    let from_below = dot(ray, still) > 0.0;
+    if from_below {
+        normal = -normal;
+    }
+    let facing = max(-dot(ray, normal), 0.0);
+
+    // Through the surface. The bed's depth below it is that along the ray not bent, then that at the place it bends to.
+    let straight = scene_distance(here, ahead);
+    var depth = max(straight - distance, 0.0) * abs(ray.z);
+    let bent = select(refract(ray, normal, water.optics.y), ray, from_below);
+    let down = max(abs(bent.z), 0.05);
+    let bed = projected(p + bent * min(depth / down, 1e7));
+    var place = here;
+    let other_ray = ray_through(bed.xy);
+    let other = scene_distance(bed.xy, dot(other_ray, frame.forward.xyz));
+    // What stands before the surface is not seen through it.
+    let other_depth = p.z - other_ray.z * other;
+    if !from_below && bed.z > 0.0 && outside(bed.xy) == 0.0 && other_depth > 0.0 {
+        place = bed.xy;
+        depth = other_depth;
+    }
+    // Light comes down, and up to the eye; seen from below it is the way to the surface that counts.
+    let way = select(depth * (1.0 + 1.0 / down), distance, from_below);
+    let left = exp(-water.absorption.rgb * way);
+    let seen = textureSampleLevel(scene, smooth_sampler, place, 0.0).rgb;
+    let body = lit(water.body.rgb, vec3<f32>(0.0, 0.0, 1.0));
+    let through = mix(body, seen, left);
+    if from_below {
+        return encoded(through);
+    }
+
+    // From the surface.
+    let shore = 1.0 - exp(-depth / max(water.absorption.w, 1e-12));
+    let rest = 1.0 - facing;
+    let fresnel = shore * (water.optics.x + (1.0 - water.optics.x) * rest * rest * rest * rest * rest);
+    var back = reflect(ray, normal);
+    // A wave's far side mirrors what a lower wave before it does: nearly the horizon.
+    back = normalize(vec3<f32>(back.xy, abs(back.z)));
+    var image = projected(vec3<f32>(back.xy, -back.z) * 1e6);
+    // Past a shore the mirrored picture shows what is behind the bank, whose foot is clipped: there the still surface's
+    // is nearer to the truth.
+    let inside = clamp(image.xy, vec2<f32>(0.0), vec2<f32>(1.0));
+    let beyond = ray_through(inside);
+    let bank = beyond.z * scene_distance(inside, dot(beyond, frame.forward.xyz));
+    if image.z > 0.0 && bank > p.z + 0.002 * distance && bank < 1e9 {
+        image = vec3<f32>(here, 1.0);
+    }
+    let found = textureSampleLevel(mirrored, smooth_sampler, image.xy, 0.0).rgb;
+    // Past the edges nothing was drawn.
+    let lost = select(1.0, smoothstep(0.0, 0.1, outside(image.xy)), image.z > 0.0);
+    let above = mix(found, sky_towards(back), lost);
+    let sun = max(dot(back, frame.sun.xyz), 0.0);
+    let glitter = water.optics.w * (pow(sun, 900.0) * 12.0 + pow(sun, 60.0) * 0.25);
+    let colour = mix(hazed(through, p), above + glitter * vec3<f32>(1.08, 1.04, 0.97), fresnel);
+    return encoded(colour);
+}
