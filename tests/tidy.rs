@@ -13,6 +13,7 @@ const PROTOCOL: &[(&str, &[&str])] = &[
     ("points", &["bintree", "bitree", "diamond", "rans"]),
     ("tin", &["bintree", "bitree", "diamond", "rans"]),
     ("index", &["bintree", "diamond", "wire"]),
+    ("projection", &[]),
     ("sight", &["bintree"]),
     ("message", &["bintree", "diamond", "points", "wire", "zone"]),
     ("zone", &["bintree", "diamond"]),
@@ -86,7 +87,10 @@ const CLIENT: &[(&str, &[&str])] = &[
     ("headless", &["camera", "fetch", "overview", "picture", "render", "surface", "terrain"]),
     (
         "viewer",
-        &["camera", "controls", "drawing", "headless", "overview", "pick", "picture", "render", "terrain"],
+        &[
+            "camera", "controls", "drawing", "headless", "overview", "pick", "picture", "render", "surface",
+            "terrain",
+        ],
     ),
     ("web", &["encoding", "fetch", "render", "terrain", "viewer"]),
     // The command line.

@@ -141,7 +141,8 @@ async fn open(page: &Page) -> Result<(), String> {
     page.title(&format!("{} - Diamantina", scene.name));
     let look = Look::of(scene);
     let link = address.link(&scene.name);
-    let viewer = Viewer::new(terrain, &link, look, size, camera);
+    let mut viewer = Viewer::new(terrain, &link, look, size, camera);
+    viewer.recall(viewer::read_bookmarks(&page.recall(&shelf(viewer.url())).unwrap_or_default()));
     let events = EventLoop::new().map_err(|e| e.to_string())?;
     let shown = Shown {
         viewer,
@@ -157,6 +158,11 @@ async fn open(page: &Page) -> Result<(), String> {
     };
     events.spawn_app(shown);
     Ok(())
+}
+
+/// The name under which the browser keeps a scene's bookmarks.
+fn shelf(url: &str) -> String {
+    format!("diamantina bookmarks {url}")
 }
 
 /// The viewer in its canvas.
@@ -209,6 +215,11 @@ impl Shown {
                 Ask::Copy(text) => {
                     self.page.copy(&text);
                     self.viewer.tell(format!("copied {text}"));
+                }
+                Ask::Keep(text) => {
+                    if !self.page.keep(&shelf(self.viewer.url()), &text) {
+                        self.viewer.tell("this browser keeps no bookmarks beyond this page");
+                    }
                 }
                 Ask::Screenshot(_) => {
                     self.wants_picture = true;

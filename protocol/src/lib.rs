@@ -11,6 +11,7 @@
 //! | [`tin`] | the irregular triangles of a diamond ⇄ bytes |
 //! | [`rans`] | the entropy coder under both |
 //! | [`index`] | pages of errors, heights and sizes, from which a client knows the cut |
+//! | [`projection`] | longitude and latitude ⇄ the coordinates of a reference system |
 //! | [`sight`] | how large an error of heights looks |
 //! | [`message`] | routes, catalogue, batch frames |
 //! | [`zone`] | regions where the viewer stays, and how much of each diamond is seen from there |
@@ -27,6 +28,7 @@ pub mod diamond;
 pub mod index;
 pub mod message;
 pub mod points;
+pub mod projection;
 pub mod rans;
 pub mod sight;
 pub mod tin;

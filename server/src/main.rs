@@ -813,6 +813,16 @@ fn experiment(args: &ExperimentArgs, given: &clap::ArgMatches) -> Result<(), Fai
         Failure(code, e.to_string())
     })?;
     report.write(&args.output)?;
+    let others = report.others(&args.output);
+    if !others.is_empty() {
+        // Nothing is left to do if standard error is closed.
+        let _ = writeln!(
+            std::io::stderr(),
+            "notice: {}: these are of another run, and not in report.html: {}",
+            args.output.display(),
+            others.join(", ")
+        );
+    }
     let mut out = std::io::stdout().lock();
     if args.json {
         return Ok(shown(writeln!(out, "{}", serde_json::to_string_pretty(&report)?))?);

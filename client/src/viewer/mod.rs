@@ -13,10 +13,18 @@
 //! All input comes through egui, so the same code serves a window and whatever else egui runs in, and a test can press
 //! keys and drag without any window.
 
+mod bookmarks;
+mod boxes;
 pub(crate) mod display;
+mod measure;
 mod panel;
 #[cfg(not(target_arch = "wasm32"))]
+mod shelf;
+#[cfg(not(target_arch = "wasm32"))]
 pub mod window;
+
+pub use bookmarks::{Bookmark, read as read_bookmarks};
+pub use measure::Mark;
 
 use crate::camera::Camera;
 use crate::controls::{self, Controls, Thrust};
@@ -28,6 +36,8 @@ use crate::terrain::{FrameView, Terrain};
 use diamantina_protocol::message::Kind;
 use egui::{Event, Key, Modifiers, PointerButton, Sense, Ui};
 use glam::{DVec2, DVec3};
+use bookmarks::Bookmarks;
+use measure::{Globe, Profile};
 use panel::History;
 use std::path::PathBuf;
 
@@ -46,17 +56,6 @@ const CLEARANCE_CELLS: f64 = 0.5;
 /// ... and the least distance to what it zooms to.
 const NEAREST_CELLS: f64 = 3.0;
 
-/// A place that was clicked.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Mark {
-    /// In the frame's metres, its height as it is.
-    pub place: DVec3,
-    /// How far its height may be off the finest surface's, in metres, if that is known.
-    pub error: Option<f64>,
-    /// The layer.
-    pub layer: usize,
-}
-
 /// What whoever shows the viewer is asked to do.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Ask {
@@ -64,6 +63,8 @@ pub enum Ask {
     Screenshot(PathBuf),
     /// To put a text on the clipboard.
     Copy(String),
+    /// To keep the scene's bookmarks, as [`read_bookmarks`] reads them, until the viewer is opened again.
+    Keep(String),
     /// To end.
     Quit,
 }
@@ -86,7 +87,11 @@ pub struct Viewer {
     grabbed: Option<DVec3>,
     /// The last two places that were clicked.
     marks: Vec<Mark>,
+    profile: Profile,
+    globe: Option<Globe>,
+    bookmarks: Bookmarks,
     panel_is_open: bool,
+    shows_boxes: bool,
     history: History,
     drawn: FrameStats,
     message: Option<String>,
@@ -100,6 +105,7 @@ impl Viewer {
         terrain.set_exaggeration(look.exaggeration);
         let home = overview::stretched_overview(terrain.scene(), size, look.exaggeration);
         let stretched = |c: Camera| Camera { size, ..overview::stretched(&c, look.exaggeration) };
+        let globe = Globe::of(&terrain.scene().frame);
         let visible = vec![true; terrain.scene().layers.len()];
         Self {
             controls: Controls::new(stretched(camera.unwrap_or(home))),
@@ -113,7 +119,11 @@ impl Viewer {
             frozen: None,
             grabbed: None,
             marks: Vec::new(),
+            profile: Profile::default(),
+            globe,
+            bookmarks: Bookmarks::default(),
             panel_is_open: true,
+            shows_boxes: false,
             history: History::default(),
             drawn: FrameStats::default(),
             message: None,
@@ -131,6 +141,12 @@ impl Viewer {
     #[must_use]
     pub fn look(&self) -> &Look {
         &self.look
+    }
+
+    /// The scene's address.
+    #[must_use]
+    pub fn url(&self) -> &str {
+        &self.url
     }
 
     /// The terrain.
@@ -225,6 +241,10 @@ impl Viewer {
             self.controls.stay_above(ground, CLEARANCE_CELLS * self.cell());
         }
         self.frame = self.terrain.frame(self.controls.camera());
+        measure::follow(self);
+        if self.shows_boxes {
+            boxes::show(self, ui);
+        }
         self.history.note(seconds, &self.frame);
         let has_waves = self.has_waves();
         if has_waves {
@@ -293,6 +313,15 @@ impl Viewer {
         if response.drag_stopped() {
             self.grabbed = None;
         }
+        // Two fingers: they turn and tilt what is between them; that they spread is a zoom, below.
+        if let Some(touch) = ui.input(egui::InputState::multi_touch) {
+            let middle = pixel(touch.center_pos);
+            let point = self.pivot(middle);
+            let tilt = f64::from(touch.translation_delta.y) * TURN_PER_POINT;
+            // The ground turns as the fingers do, so the view the other way.
+            self.controls.turn(point, -f64::from(touch.rotation_delta), -tilt);
+            self.grabbed = None;
+        }
         if let Some(at) = response.hover_pos() {
             let (scroll, pinch) = ui.input(|input| (input.smooth_scroll_delta().y, input.zoom_delta()));
             let factor = (-f64::from(scroll) * ZOOM_PER_POINT).exp() / f64::from(pinch);
@@ -319,7 +348,8 @@ impl Viewer {
     fn mark(&mut self, hit: &Hit) {
         let error = self.terrain.error_metres(hit.layer, hit.diamond, hit.side);
         let place = hit.point.with_z(hit.point.z / self.look.exaggeration);
-        self.marks.push(Mark { place, error, layer: hit.layer });
+        let lonlat = self.globe.as_ref().and_then(|globe| globe.lonlat(place));
+        self.marks.push(Mark { place, lonlat, error, layer: hit.layer });
         if self.marks.len() > 2 {
             self.marks.remove(0);
         }

@@ -1,6 +1,6 @@
 //! The panel: what can be chosen, figures, and what was clicked.
 
-use super::{Ask, Mark, Viewer};
+use super::{Ask, Viewer, bookmarks, measure};
 use crate::render::{Background, Colours};
 use crate::terrain::FrameView;
 use diamantina_protocol::message::Kind;
@@ -57,7 +57,10 @@ pub(super) fn show(viewer: &mut Viewer, ui: &mut Ui) {
             view(viewer, ui);
             light(viewer, ui);
             water(viewer, ui);
-            marks(viewer, ui);
+            heading(ui, "Clicked");
+            measure::show(viewer, ui);
+            heading(ui, "Bookmarks");
+            bookmarks::show(viewer, ui);
             figures(viewer, ui);
             keys(ui);
         });
@@ -122,6 +125,7 @@ fn view(viewer: &mut Viewer, ui: &mut Ui) {
     });
     ui.checkbox(&mut viewer.look.wireframe, "wireframe");
     ui.checkbox(&mut viewer.look.show_levels, "levels as colours");
+    ui.checkbox(&mut viewer.shows_boxes, "bounding boxes");
     let mut is_frozen = viewer.frozen.is_some();
     if ui.checkbox(&mut is_frozen, "freeze what is drawn").changed() {
         viewer.frozen = is_frozen.then(|| viewer.frame.items.clone());
@@ -161,28 +165,6 @@ fn light(viewer: &mut Viewer, ui: &mut Ui) {
     if ui.checkbox(&mut has_sky, "sky").changed() {
         viewer.look.background =
             if has_sky { Background::Sky } else { Background::Colour([0.003, 0.003, 0.004, 1.0]) };
-    }
-}
-
-fn marks(viewer: &Viewer, ui: &mut Ui) {
-    heading(ui, "Clicked");
-    let row = |ui: &mut Ui, mark: &Mark| {
-        let error = mark.error.map_or(String::new(), |error| format!(" ± {error:.1}"));
-        ui.monospace(format!("{:.1}, {:.1}", mark.place.x, mark.place.y));
-        let layer = &viewer.terrain.scene().layers[mark.layer].name;
-        ui.monospace(format!("height {:.1}{error} m, {layer}", mark.place.z));
-    };
-    match viewer.marks() {
-        [] => {
-            ui.label(RichText::new("Click the ground for its height.").weak());
-        }
-        [one] => row(ui, one),
-        [first, last, ..] => {
-            row(ui, first);
-            row(ui, last);
-            let by = last.place - first.place;
-            ui.monospace(format!("{:.1} m apart on the level, {:+.1} m up", by.truncate().length(), by.z));
-        }
     }
 }
 
@@ -267,7 +249,7 @@ fn keys(ui: &mut Ui) {
     for (what, does) in [
         ("drag", "moves the ground"),
         ("Ctrl, right or middle drag", "turns around it"),
-        ("wheel", "goes to the cursor"),
+        ("wheel, or two fingers", "goes to the cursor; fingers turn and tilt, too"),
         ("double click", "flies there"),
         ("W A S D, Q E", "fly (Shift: faster)"),
         ("arrows", "look around"),

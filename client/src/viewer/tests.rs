@@ -274,3 +274,100 @@ fn a_frozen_cut_stays_while_the_eye_moves() {
     hand.viewer.visible[0] = false;
     assert!(hand.viewer.items().is_empty());
 }
+
+#[test]
+fn two_clicks_tell_the_profile_between_them() {
+    let mut hand = Hand::new(Some(looking_down()));
+    let [a, b] = hand.solid();
+    hand.click(a);
+    hand.settle();
+    assert!(hand.viewer.profile.heights().is_empty(), "one place has no profile");
+    hand.click(b);
+    hand.settle();
+    hand.frame(&[]);
+    let heights = hand.viewer.profile.heights().to_vec();
+    let [first, last] = hand.viewer.marks()[..] else { panic!("two marks") };
+    assert!(heights.len() > 100);
+    for (height, mark) in [(heights[0], first), (heights[heights.len() - 1], last)] {
+        assert!((height.unwrap() - mark.place.z).abs() < 0.5, "{height:?} {mark:?}");
+    }
+    let middle = first.place.lerp(last.place, 0.5).truncate();
+    let layers = hand.viewer.terrain.scene().layers.clone();
+    let ground = hand.viewer.picker.ground(&layers, &hand.viewer.frame.items, 1.0, middle);
+    assert_eq!(heights[heights.len() / 2], ground);
+    hand.key(Key::Escape, true);
+    hand.frame(&[]);
+    assert!(hand.viewer.profile.heights().is_empty());
+}
+
+#[test]
+fn views_are_kept_and_found_again() {
+    let mut hand = Hand::new(None);
+    let home = hand.camera();
+    hand.viewer.keep();
+    hand.viewer.fly_to(&looking_down());
+    hand.settle();
+    hand.viewer.keep();
+    let texts: Vec<String> = hand
+        .viewer
+        .take_asks()
+        .into_iter()
+        .filter_map(|ask| if let Ask::Keep(text) = ask { Some(text) } else { None })
+        .collect();
+    assert_eq!(texts.len(), 2);
+    let mut again = Hand::new(Some(looking_down()));
+    again.viewer.recall(read_bookmarks(&texts[1]));
+    let names: Vec<&str> = again.viewer.bookmarks().iter().map(|one| one.name.as_str()).collect();
+    assert_eq!(names, ["view 1", "view 2"]);
+    let first = camera_at(&again.viewer.bookmarks()[0].view, SIZE).unwrap();
+    again.viewer.fly_to(&first);
+    again.settle();
+    assert!((again.camera().eye - home.eye).length() < 0.1, "{:?}", again.camera());
+}
+
+#[test]
+fn two_fingers_turn_what_is_between_them() {
+    let mut hand = Hand::new(None);
+    let [at, _] = hand.solid();
+    let before = hand.camera();
+    let heading = hand.viewer.controls.heading();
+    let touch = |id: u64, phase: egui::TouchPhase, pos: Pos2| Event::Touch {
+        device_id: egui::TouchDeviceId(1),
+        id: egui::TouchId(id),
+        phase,
+        pos,
+        force: None,
+    };
+    let fingers = |angle: f32| [1.0, -1.0].map(|side| at + side * 60.0 * vec2(angle.cos(), angle.sin()));
+    let [a, b] = fingers(0.0);
+    hand.frame(&[touch(1, egui::TouchPhase::Start, a), touch(2, egui::TouchPhase::Start, b)]);
+    for i in 1..=10 {
+        let [a, b] = fingers(0.05 * i as f32);
+        hand.frame(&[touch(1, egui::TouchPhase::Move, a), touch(2, egui::TouchPhase::Move, b)]);
+    }
+    // Clockwise on the screen: the view turns to the left.
+    let turned = hand.viewer.controls.heading() - heading;
+    assert!((turned + 0.5).abs() < 0.1, "{turned}");
+    let distance = |camera: &Camera| (camera.target - camera.eye).length();
+    assert!((distance(&hand.camera()) / distance(&before) - 1.0).abs() < 0.1, "they did not spread");
+}
+
+#[test]
+fn boxes_are_drawn_around_what_is_drawn() {
+    let mut hand = Hand::new(None);
+    let lines = |hand: &mut Hand| {
+        let input = RawInput {
+            screen_rect: Some(Rect::from_min_size(Pos2::ZERO, vec2(SIZE[0] as f32, SIZE[1] as f32))),
+            time: Some(hand.seconds + 1.0),
+            ..RawInput::default()
+        };
+        let viewer = &mut hand.viewer;
+        let output = hand.context.run_ui(input, |ui| viewer.update(ui));
+        let lines = output.shapes.iter().filter(|s| matches!(s.shape, egui::Shape::LineSegment { .. })).count();
+        output.drop_without_applying_deltas();
+        lines
+    };
+    let without = lines(&mut hand);
+    hand.viewer.shows_boxes = true;
+    assert!(lines(&mut hand) >= without + 12);
+}

@@ -1,6 +1,7 @@
 //! The viewer in a native window.
 
 use super::display::{Display, IDLE};
+use super::shelf::Shelf;
 use super::{Ask, Viewer};
 use crate::render::{self, Offscreen, RenderError};
 use crate::{headless, picture};
@@ -28,10 +29,16 @@ pub enum WindowError {
 ///
 /// # Errors
 /// When there is no screen, or no graphics adapter that draws on it.
-pub fn run(viewer: Viewer, title: &str, options: &render::Options) -> Result<(), WindowError> {
+pub fn run(mut viewer: Viewer, title: &str, options: &render::Options) -> Result<(), WindowError> {
     let system = |e: &dyn std::fmt::Display| WindowError::System(e.to_string());
     let events = EventLoop::new().map_err(|e| system(&e))?;
+    let shelf = Shelf::of(viewer.url());
+    match shelf.recall() {
+        Ok(bookmarks) => viewer.recall(bookmarks),
+        Err(error) => viewer.tell(error.to_string()),
+    }
     let mut shown = Shown {
+        shelf,
         viewer,
         title: title.to_owned(),
         options: *options,
@@ -44,6 +51,7 @@ pub fn run(viewer: Viewer, title: &str, options: &render::Options) -> Result<(),
 }
 
 struct Shown {
+    shelf: Shelf,
     viewer: Viewer,
     title: String,
     options: render::Options,
@@ -71,6 +79,11 @@ impl Shown {
                         display.set_clipboard_text(&text);
                     }
                     self.viewer.tell(format!("copied {text}"));
+                }
+                Ask::Keep(text) => {
+                    if let Err(error) = self.shelf.keep(&text) {
+                        self.viewer.tell(error.to_string());
+                    }
                 }
                 Ask::Screenshot(path) => {
                     let saved = self.photograph(&path);

@@ -107,6 +107,17 @@ impl Page {
         }
     }
 
+    /// What this browser keeps under a name, if it keeps anything.
+    pub(super) fn recall(&self, name: &str) -> Option<String> {
+        self.window.local_storage().ok()??.get_item(name).ok()?
+    }
+
+    /// Has the browser keep a text under a name; whether it does.
+    pub(super) fn keep(&self, name: &str, text: &str) -> bool {
+        let storage = self.window.local_storage().ok().flatten();
+        storage.is_some_and(|storage| storage.set_item(name, text).is_ok())
+    }
+
     /// Puts a text on the clipboard, if the browser allows it.
     pub(super) fn copy(&self, text: &str) {
         let written: Promise = self.window.navigator().clipboard().write_text(text);

@@ -1,13 +1,4 @@
-//! The query of a batch: any text is a list of centres or an error, and a list written again is the same.
+//! See `src/batch_query.rs`.
 #![no_main]
 
-use diamantina_protocol::message::{BATCH_MAX, batch_route, parse_batch};
-use libfuzzer_sys::fuzz_target;
-
-fuzz_target!(|text: &str| {
-    let Ok(centres) = parse_batch(text) else { return };
-    assert!((1..=BATCH_MAX).contains(&centres.len()));
-    let route = batch_route("s", "v", "l", &centres);
-    let query = route.split_once("d=").expect("a batch's route has a query").1;
-    assert_eq!(parse_batch(query), Ok(centres));
-});
+libfuzzer_sys::fuzz_target!(|data: &[u8]| diamantina_fuzz::batch_query::run(data));

@@ -1,15 +1,4 @@
-//! Zones: any bytes are masks or an error, and masks written again are the same bytes.
+//! See `src/zone.rs`.
 #![no_main]
 
-use diamantina_protocol::bintree::Forest;
-use diamantina_protocol::zone;
-use libfuzzer_sys::fuzz_target;
-
-fuzz_target!(|data: &[u8]| {
-    let [layers, bytes @ ..] = data else { return };
-    let precise = Forest::new(5, 2, [1, 1]).and_then(|f| f.with_precision(3));
-    let forests = [Forest::new(6, 2, [2, 1]), precise].map(|f| f.expect("within the documented limits"));
-    let forests = &forests[..usize::from(*layers % 3)];
-    let Ok(masks) = zone::decode(forests, bytes) else { return };
-    assert_eq!(zone::encode(&masks), bytes);
-});
+libfuzzer_sys::fuzz_target!(|data: &[u8]| diamantina_fuzz::zone::run(data));

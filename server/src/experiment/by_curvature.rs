@@ -73,7 +73,7 @@ fn one(
     pictures: &mut Vec<Picture>,
 ) -> Result<(), ExperimentError> {
     let field = &window.field;
-    let eye = eye(run, field);
+    let eye = eye(run, window)?;
     let full = view::render(field, field.heights(), eye);
     let mask = window.weights.clone().unwrap_or_else(|| grown(field, &full.seen));
     let around = grown(field, &seen_around(field, eye));
@@ -147,16 +147,27 @@ fn png(file: String, caption: &str, view: &View) -> Result<Picture, ExperimentEr
 }
 
 /// The observer of the options, or on the highest sample of the southern eighth; looks at the field's middle.
-fn eye(run: &Run<'_>, field: &Field) -> Eye {
+fn eye(run: &Run<'_>, window: &Window) -> Result<Eye, ExperimentError> {
+    let field = &window.field;
     let side = f64::from(field.side());
     let strip = (field.row() / 8 + 1) * field.row();
     let known = (0..strip).filter(|slot| !field.heights()[*slot].is_nan());
     let highest = known.max_by(|a, b| field.heights()[*a].total_cmp(&field.heights()[*b])).unwrap_or(0);
     let [x, y] = run.options.observer.unwrap_or_else(|| field.point(highest)).map(|v| v.min(field.side()));
-    let [low, high] = field.range();
-    let ground = Some(field.at([x, y])).filter(|h| !h.is_nan()).unwrap_or(low.midpoint(high));
+    let ground = match (field.at([x, y]), run.options.observer) {
+        (height, _) if !height.is_nan() => height,
+        // Nothing of the strip has data.
+        (_, None) => field.range()[0].midpoint(field.range()[1]),
+        (_, Some(_)) => {
+            return Err(ExperimentError::Options {
+                option: "--observer",
+                expected: "a sample with data".to_owned(),
+                found: format!("none at {x},{y} of {}", window.label()),
+            });
+        }
+    };
     let at = [f64::from(x), f64::from(y)];
-    Eye { at, height: ground + run.options.eye, towards: [0.5 * side, 0.55 * side], rise: 0.0 }
+    Ok(Eye { at, height: ground + run.options.eye, towards: [0.5 * side, 0.55 * side], rise: 0.0 })
 }
 
 fn full_polygons(field: &Field) -> f64 {

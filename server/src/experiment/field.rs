@@ -5,9 +5,10 @@
 //! above the largest (4000 m: to 8 µm), which changes nothing in integers: then all means of means down to
 //! the finest level are exact in `f64`, and an error of 0 is 0.
 
+use super::scan::rows;
 use crate::ingest::{IngestError, Source};
 use diamantina_protocol::bintree::Point;
-use diamantina_protocol::bitree::{Bitree, LOG2_MAX};
+use diamantina_protocol::bitree::{self, Bitree, LOG2_MAX};
 
 /// Bits of a height; with the 24 halvings of the deepest grid and a sign they fit the 53 of `f64`.
 const MANTISSA_BITS: f64 = 28.0;
@@ -104,6 +105,23 @@ impl Field {
     #[must_use]
     pub fn at(&self, point: Point) -> f64 {
         self.heights[self.slot(point)]
+    }
+
+    /// The coarsest sample with data below a triangle of the bintree, its corners apart: what it can split at where its middle
+    /// has none. The first by rows among those of a level; `None` if it knows nothing but its corners.
+    #[must_use]
+    pub fn known_below(&self, corners: [Point; 3]) -> Option<Point> {
+        let mut best: Option<(u32, Point)> = None;
+        rows(corners, |y, first, last| {
+            for p in (first..=last).map(|x| [x, y]).filter(|p| !corners.contains(p)) {
+                let level = bitree::level(self.log2, p);
+                if best.is_none_or(|(coarsest, _)| level < coarsest) && !self.at(p).is_nan() {
+                    best = Some((level, p));
+                }
+            }
+            true
+        });
+        best.map(|(_, p)| p)
     }
 
     /// Samples that have data.

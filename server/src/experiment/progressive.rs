@@ -197,7 +197,7 @@ fn by_tolerance(field: &Field) -> [Vec<Bitree>; 2] {
         let [bitree, quadtree] = trees.each_ref().map(|list| list[list.len() - 1].clone());
         trees[0].push(greedy(&ground, Criterion::Vertical, tolerance, GREEDY_SHARE, usize::MAX, bitree));
         let error = |facet: &Facet, enough: f64| Criterion::Vertical.error(&ground, facet, enough);
-        trees[1].push(quadtree::complete(field, &quadtree, tolerance, error));
+        trees[1].push(quadtree::complete(field, &quadtree, tolerance, false, error));
         tolerance /= 2.0;
     }
     trees

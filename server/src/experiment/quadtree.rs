@@ -89,17 +89,21 @@ fn apexes(log2: u8, [x, y]: Point, s: u32, side: u32) -> [Option<Point>; 2] {
 
 /// The quadtree's own selection, from the top: splits both triangles at a hypotenuse while `error` of either
 /// is more than `tolerance` (it may stop counting beyond that), and whatever they depend on. All heights are samples'; no smaller
-/// quadtree holds every triangle within the tolerance.
-pub fn select(field: &Field, tolerance: f64, error: impl Fn(&Facet, f64) -> f64) -> Bitree {
-    complete(field, &field.tree(), tolerance, error)
+/// quadtree holds every triangle within the tolerance. See [`complete`] of `blindly`.
+pub fn select(field: &Field, tolerance: f64, blindly: bool, error: impl Fn(&Facet, f64) -> f64) -> Bitree {
+    complete(field, &field.tree(), tolerance, blindly, error)
 }
 
 /// The smallest quadtree within the tolerance that has all points of a selection. A selection that is within it by
 /// itself may leave it when it is closed, as the points that it depends on move the surface; then more have to split.
+///
+/// A middle without data cannot be transmitted. Where an error tells which sample is wrong, that sample makes the triangle
+/// split; where it does not (`blindly`), the coarsest sample below that has data does.
 pub fn complete(
     field: &Field,
     selected: &Bitree,
     tolerance: f64,
+    blindly: bool,
     error: impl Fn(&Facet, f64) -> f64,
 ) -> Bitree {
     let full = field.full_tree();
@@ -113,7 +117,10 @@ pub fn complete(
         if wanted[field.slot(facet.middle())] {
             open.extend(full.halves(&facet));
         } else if error(&facet, tolerance) > tolerance {
-            force(field, &full, facet.middle(), &mut wanted, &mut open);
+            let middle = facet.middle();
+            let is_blind = blindly && field.at(middle).is_nan();
+            let below = if is_blind { field.known_below(facet.corners()) } else { None };
+            force(field, &full, below.unwrap_or(middle), &mut wanted, &mut open);
         }
     }
     let mut tree = selected.clone();

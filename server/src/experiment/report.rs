@@ -91,6 +91,22 @@ impl Report {
         save("report.html", self.html().as_bytes())
     }
 
+    /// Tables and pictures in a folder that this report does not have: those of another run.
+    #[must_use]
+    pub fn others(&self, folder: &Path) -> Vec<String> {
+        let tables = self.tables.iter().map(|table| format!("{}.csv", table.name));
+        let own: Vec<String> = tables.chain(self.pictures.iter().map(|p| p.file.clone())).collect();
+        let is_one = |name: &String| {
+            let ending = Path::new(name).extension().and_then(|e| e.to_str());
+            matches!(ending, Some("csv" | "svg" | "png")) && !own.contains(name)
+        };
+        let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+        let mut names: Vec<String> =
+            entries.filter_map(|entry| entry.file_name().into_string().ok()).filter(is_one).collect();
+        names.sort_unstable();
+        names
+    }
+
     /// One page that needs nothing but the pictures beside it.
     #[must_use]
     pub fn html(&self) -> String {
@@ -152,6 +168,9 @@ mod tests {
         assert!(report.html().contains("a &amp; b") && report.html().contains("a &lt;b&gt;"));
         let folder = tempfile::tempdir().unwrap();
         report.write(&folder.path().join("new")).unwrap();
+        assert!(report.others(&folder.path().join("new")).is_empty());
+        std::fs::write(folder.path().join("new/old.csv"), "").unwrap();
+        assert_eq!(report.others(&folder.path().join("new")), ["old.csv"]);
         assert!(folder.path().join("new/t.csv").exists() && folder.path().join("new/report.html").exists());
     }
 }

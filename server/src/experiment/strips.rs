@@ -5,7 +5,7 @@
 //! told by the vertices that a first-in first-out cache of 32 has to fetch for it.
 
 use super::report::{Picture, Report, Table};
-use super::select::{Ground, scale, select};
+use super::select::{Ground, Strategy, scale, select};
 use super::{ExperimentError, Run, mean_and_spread, plot};
 use diamantina_protocol::bintree::Point;
 use diamantina_protocol::bitree::{Bitree, strip};
@@ -33,6 +33,7 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     ];
     let caption = "Orders of the bitree's triangles; 'full' is every sample of the grid";
     let mut table = Table::new("strips", caption, &columns);
+    let mut sums = vec![Vec::new(); run.options.tolerances.len()];
     let steps = run.windows.len() * (run.options.tolerances.len() + 1);
     run.progress.stage("ordering", "meshes", steps as u64, 0);
     // Percent that one strip and several save, by tolerance and window.
@@ -42,10 +43,10 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
         let Some(ground) = Ground::new(&window.field, window.weights.as_deref()) else { continue };
         let mut push = |label: [String; 2], tree: &Bitree| {
             let place = [window.source.clone(), window.at[0].to_string(), window.at[1].to_string()];
-            let (cells, saved) = row(tree);
-            table.push(place.into_iter().chain(label).chain(cells));
+            let row = row(tree);
+            table.push(place.into_iter().chain(label).chain(row.cells.clone()));
             run.progress.advance(1);
-            saved
+            row
         };
         push(["full".to_owned(), String::new()], &window.field.full_tree());
         for (i, percent) in run.options.tolerances.iter().enumerate() {
@@ -54,8 +55,9 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
             }
             let tolerance = percent / 100.0 * scale(&ground, run.options.criterion);
             let (tree, strategy) = select(&ground, run.options.criterion, tolerance);
-            let both = push([percent.to_string(), strategy.to_string()], &tree);
-            saved.iter_mut().zip(both).for_each(|(saved, one)| saved[i].push(one));
+            let row = push([percent.to_string(), strategy.to_string()], &tree);
+            saved.iter_mut().zip(row.saved).for_each(|(saved, one)| saved[i].push(one));
+            sums[i].push((strategy, row.counts));
         }
     }
     let line = |(name, saved): (&str, &Vec<Vec<f64>>)| {
@@ -75,23 +77,32 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
              by points and then triangles."
                 .to_owned(),
         ],
-        tables: vec![table],
+        tables: vec![means(run, &sums), table],
         pictures: vec![Picture { file: "strips.svg".to_owned(), caption, bytes }],
     })
 }
 
-/// The cells of a mesh, and the percent that one strip and several save.
-fn row(tree: &Bitree) -> (Vec<String>, [f64; 2]) {
+/// What is told of a mesh.
+struct Row {
+    cells: Vec<String>,
+    /// Percent that one strip and several save.
+    saved: [f64; 2],
+    /// Triangles, line triangles, and references: separate, of one strip, of several.
+    counts: [usize; 5],
+}
+
+fn row(tree: &Bitree) -> Row {
     let one = strip::strip(tree);
     let triangles = strip::triangles(&one);
     let several = greedy_strips(&triangles);
     let references = several.iter().map(Vec::len).sum::<usize>() + several.len().saturating_sub(1);
     let separate = 3 * triangles.len();
+    let lines = strip::line_triangles(&one);
     let saved = [one.len(), references].map(|n| 100.0 * (1.0 - n as f64 / separate as f64));
     let cells = vec![
         triangles.len().to_string(),
         separate.to_string(),
-        strip::line_triangles(&one).to_string(),
+        lines.to_string(),
         one.len().to_string(),
         format!("{:.1}", saved[0]),
         several.len().to_string(),
@@ -99,7 +110,37 @@ fn row(tree: &Bitree) -> (Vec<String>, [f64; 2]) {
         format!("{:.1}", saved[1]),
         format!("{:.3}", fetches(&triangles) as f64 / triangles.len() as f64),
     ];
-    (cells, saved)
+    Row { cells, saved, counts: [triangles.len(), lines, separate, one.len(), references] }
+}
+
+/// The windows' means by tolerance; and what strips save of all their references together, in which large meshes count for more.
+fn means(run: &Run<'_>, sums: &[Vec<(Strategy, [usize; 5])>]) -> Table {
+    let columns = [
+        "tolerance [%]",
+        "windows",
+        "of these compact",
+        "triangles",
+        "line triangles",
+        "separate references",
+        "strip references",
+        "saved by the strip: mean of windows [%]",
+        "saved by the strip: of all references [%]",
+        "saved by the strips: mean of windows [%]",
+        "saved by the strips: of all references [%]",
+    ];
+    let mut table = Table::new("means", "Means of the windows", &columns);
+    for (percent, list) in run.options.tolerances.iter().zip(sums) {
+        let compact = list.iter().filter(|(strategy, _)| *strategy == Strategy::Compact).count();
+        let mean = |i: usize| list.iter().map(|(_, c)| c[i] as f64).sum::<f64>() / list.len().max(1) as f64;
+        let saved = |i: usize| {
+            let each = list.iter().map(|(_, c)| 100.0 * (1.0 - c[i] as f64 / c[2] as f64)).collect::<Vec<_>>();
+            [mean_and_spread(&each)[0], 100.0 * (1.0 - mean(i) / mean(2))].map(|p| format!("{p:.1}"))
+        };
+        let counts = [0, 1, 2, 3].map(|i| format!("{:.1}", mean(i)));
+        let head = [percent.to_string(), list.len().to_string(), compact.to_string()];
+        table.push(head.into_iter().chain(counts).chain(saved(3)).chain(saved(4)));
+    }
+    table
 }
 
 /// Vertices that a first-in first-out cache has to fetch for triangles in their order.

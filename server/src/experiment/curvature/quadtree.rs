@@ -3,6 +3,9 @@
 //! Which quadrants are split is one flag a quadrant, level by level. Sums over quadrants come from a table of
 //! sums over everything to the south-west, four look-ups each. A quadrant owns its western and southern
 //! borders, so that sums add up.
+//!
+//! A triangle with a corner that has no data is not drawn. So that no others go with it, a quadrant splits in any case while
+//! some of its samples have data and some have none, those on its border included.
 
 use super::curvatures;
 use crate::experiment::field::Field;
@@ -21,6 +24,8 @@ pub struct Observer {
 pub struct Sums {
     row: usize,
     sums: Vec<f64>,
+    /// How many samples without data there are to the south-west, by the same places; `None` if there are none at all.
+    missing: Option<Vec<u32>>,
 }
 
 impl Sums {
@@ -35,13 +40,30 @@ impl Sums {
             let at = (y + 1) * row + x + 1;
             sums[at] = weight * curvature + sums[at - 1] + sums[at - row] - sums[at - row - 1];
         }
-        Self { row, sums }
+        let mut missing = vec![0u32; row * row];
+        for (slot, height) in field.heights().iter().enumerate() {
+            let at = (slot / field.row() + 1) * row + slot % field.row() + 1;
+            missing[at] = u32::from(height.is_nan()) + missing[at - 1] + missing[at - row] - missing[at - row - 1];
+        }
+        let has_any = missing.last().is_some_and(|n| *n > 0);
+        Self { row, sums, missing: has_any.then_some(missing) }
     }
 
     /// Over `size` by `size` samples from (`x`, `y`).
     fn over(&self, x: usize, y: usize, size: usize) -> f64 {
         let at = |x: usize, y: usize| self.sums[y * self.row + x];
         at(x + size, y + size) - at(x, y + size) - at(x + size, y) + at(x, y)
+    }
+}
+
+impl Sums {
+    /// Whether some of the samples of a quadrant, all its borders included, have data and some have none.
+    fn is_mixed(&self, x: usize, y: usize, size: usize) -> bool {
+        let Some(missing) = &self.missing else { return false };
+        let at = |x: usize, y: usize| missing[y * self.row + x];
+        let last = size + 1;
+        let here = at(x + last, y + last) + at(x, y) - at(x, y + last) - at(x + last, y);
+        here > 0 && (here as usize) < last * last
     }
 }
 
@@ -69,7 +91,8 @@ impl Quadtree {
                         None => sum > threshold,
                         Some(o) => sum > 0.0 && sum >= threshold * factor(field, o, [i, j], size),
                     };
-                    split[level][j * n + i] = exists && is_curved;
+                    let is_mixed = || sums.is_mixed(i * size, j * size, size);
+                    split[level][j * n + i] = exists && (is_curved || is_mixed());
                 }
             }
         }

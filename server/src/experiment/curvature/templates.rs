@@ -138,4 +138,19 @@ mod tests {
         mask[..65 * 20].fill(1.0);
         assert!(count(&Sums::new(&field, Some(&mask)), None) < plain);
     }
+
+    #[test]
+    fn one_sample_without_data_takes_no_more_away_than_its_own_triangles() {
+        for missing in [[64u32, 0], [0, 0], [40, 17], [33, 64]] {
+            let mut heights = vec![100.0; 65 * 65];
+            heights[missing[1] as usize * 65 + missing[0] as usize] = f64::NAN;
+            let field = Field::new(6, heights, [30.0, 30.0]).unwrap();
+            let all = triangles(&Quadtree::new(&field, &Sums::new(&field, None), 1e9, None));
+            let drawn: Vec<_> = all.iter().filter(|t| t.iter().all(|p| !field.at(*p).is_nan())).collect();
+            let area: i64 = drawn.iter().map(|t| double_area(**t)).sum();
+            // The finest triangles around it, of one or two halves of a cell.
+            assert!(2 * 64 * 64 - area <= 8, "{missing:?}: {area}");
+            assert!(all.len() < 500, "{missing:?}: {}", all.len());
+        }
+    }
 }

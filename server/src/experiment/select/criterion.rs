@@ -4,7 +4,7 @@ use crate::experiment::curvature::curvatures;
 use crate::experiment::field::Field;
 use crate::experiment::scan::{Plane, rows, vertical_error};
 use diamantina_protocol::bintree::Point;
-use diamantina_protocol::bitree::{self, Bitree, Facet};
+use diamantina_protocol::bitree::{Bitree, Facet};
 use std::ops::ControlFlow;
 use std::sync::OnceLock;
 
@@ -42,23 +42,6 @@ impl<'a> Ground<'a> {
     /// Whether every sample has data and counts fully.
     pub(super) fn counts_all(&self) -> bool {
         self.weights.is_none() && self.field.samples() == self.field.heights().len()
-    }
-
-    /// The coarsest sample with data below a triangle, its corners apart: what it splits at where its middle has none. The
-    /// first by rows among those of a level.
-    pub(super) fn known_below(&self, facet: &Facet) -> Option<Point> {
-        let (field, corners) = (self.field, facet.corners());
-        let mut best: Option<(u32, Point)> = None;
-        rows(corners, |y, first, last| {
-            for p in (first..=last).map(|x| [x, y]).filter(|p| !corners.contains(p)) {
-                let level = bitree::level(field.log2(), p);
-                if best.is_none_or(|(coarsest, _)| level < coarsest) && !field.at(p).is_nan() {
-                    best = Some((level, p));
-                }
-            }
-            true
-        });
-        best.map(|(_, p)| p)
     }
 
     fn weight(&self, slot: usize) -> f64 {
@@ -116,7 +99,7 @@ impl Criterion {
 
     /// Whether a triangle splits at a middle that lies on its hypotenuse, too: sums over the triangle fall with its area,
     /// whatever its heights. Where the middle has no data, it splits at what is known below.
-    pub(super) fn splits_level(self) -> bool {
+    pub(in crate::experiment) fn splits_level(self) -> bool {
         self == Self::Curvature
     }
 
@@ -194,7 +177,7 @@ fn curvature_sum(ground: &Ground<'_>, facet: &Facet, enough: f64) -> f64 {
     });
     // Nor has one that knows nothing but its corners.
     let has_middle = !field.at(facet.middle()).is_nan();
-    if sum > 0.0 && !has_middle && ground.known_below(facet).is_none() { 0.0 } else { sum }
+    if sum > 0.0 && !has_middle && field.known_below(facet.corners()).is_none() { 0.0 } else { sum }
 }
 
 /// Over the finest triangles that this one stands for; without data at a corner they have no angle.

@@ -82,7 +82,7 @@ pub fn greedy(
         }
         let (mut point, off) = farthest(field, &facet);
         let is_blind = criterion.splits_level() && field.at(point).is_nan();
-        if is_blind && let Some(below) = ground.known_below(&facet) {
+        if is_blind && let Some(below) = field.known_below(facet.corners()) {
             point = below;
         }
         let is_level = off == 0.0 && criterion.splits_level() && !field.at(point).is_nan();

@@ -82,11 +82,11 @@ proptest! {
             prop_assert!(largest_error(&ground, Criterion::Euclidean, &tree) <= tolerance);
         }
         let vertical = |facet: &diamantina_protocol::bitree::Facet, enough: f64| Criterion::Vertical.error(&ground, facet, enough);
-        let quadtree = quadtree::select(&field, tolerance, vertical);
+        let quadtree = quadtree::select(&field, tolerance, false, vertical);
         prop_assert!(largest_error(&ground, Criterion::Vertical, &quadtree) <= tolerance);
         // So does the closure of a bitree's points, with what brings it back.
         let tree = by_strategy(&ground, Criterion::Vertical, tolerance, Strategy::Compact);
-        let closed = quadtree::complete(&field, &tree, tolerance, vertical);
+        let closed = quadtree::complete(&field, &tree, tolerance, false, vertical);
         prop_assert!(largest_error(&ground, Criterion::Vertical, &closed) <= tolerance);
         for slot in 0..SIDE * SIDE {
             let p = field.point(slot);
@@ -95,14 +95,22 @@ proptest! {
     }
 
     #[test]
-    fn criteria_that_are_no_distances_are_kept_too(field in any_field(), part in 0.0f64..0.6) {
-        let ground = Ground::new(&field, None).unwrap();
+    fn criteria_that_are_no_distances_are_kept_too(field in any_field(), part in 0.0f64..0.6, masked in any::<bool>()) {
+        let mask: Vec<f32> = (0..SIDE * SIDE).map(|s| [1.0, 0.5, 0.0][s / SIDE / 5 % 3]).collect();
+        let ground = Ground::new(&field, masked.then_some(&mask[..])).unwrap();
         for criterion in [Criterion::Curvature, Criterion::Normal] {
             let tolerance = part * scale(&ground, criterion);
             for strategy in [Strategy::Compact, Strategy::Sparse, Strategy::Greedy] {
                 let tree = by_strategy(&ground, criterion, tolerance, strategy);
                 let found = largest_error(&ground, criterion, &tree);
                 prop_assert!(found <= tolerance, "{criterion:?} {strategy} {found} {tolerance}");
+                let error = |facet: &diamantina_protocol::bitree::Facet, enough: f64| criterion.error(&ground, facet, enough);
+                let closed = quadtree::complete(&field, &tree, tolerance, criterion.splits_level(), error);
+                let own = quadtree::select(&field, tolerance, criterion.splits_level(), error);
+                for quadtree in [closed, own] {
+                    let found = largest_error(&ground, criterion, &quadtree);
+                    prop_assert!(found <= tolerance, "quadtree, {criterion:?} {strategy} {found} {tolerance}");
+                }
             }
         }
     }

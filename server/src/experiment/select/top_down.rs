@@ -66,7 +66,7 @@ pub(super) fn descend(
             let off = off(ground, facet);
             if off.is_nan() && criterion.splits_level() {
                 // Any real point below makes the middle fictitious.
-                if let Some(below) = ground.known_below(facet) {
+                if let Some(below) = field.known_below(facet.corners()) {
                     draft.add(below, field.at(below));
                 }
                 continue;

@@ -1,0 +1,214 @@
+//! What was clicked: places on the ground, and the profile between the last two.
+
+use super::Viewer;
+use diamantina_protocol::message::Frame;
+use diamantina_protocol::projection::Projection;
+use egui::{Align2, FontId, RichText, Stroke, Ui};
+use glam::DVec3;
+
+/// Places of a profile.
+const SAMPLES: usize = 200;
+
+/// Frames after which a profile is looked at again while data arrives.
+const FRAMES: u32 = 20;
+
+/// A place that was clicked.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Mark {
+    /// In the frame's metres, its height as it is.
+    pub place: DVec3,
+    /// Longitude and latitude in degrees, if the frame has such.
+    pub lonlat: Option<[f64; 2]>,
+    /// How far its height may be off the finest surface's, in metres, if that is known.
+    pub error: Option<f64>,
+    /// The layer.
+    pub layer: usize,
+}
+
+/// Where the frame lies on the globe.
+#[derive(Debug)]
+pub(super) struct Globe {
+    projection: Projection,
+    origin: [f64; 2],
+    per_metre: [f64; 2],
+}
+
+impl Globe {
+    /// `None` if that is not known.
+    pub(super) fn of(frame: &Frame) -> Option<Self> {
+        let crs = frame.crs.as_ref()?;
+        let projection = Projection::new(crs.proj4.as_deref()?).ok()?;
+        Some(Self { projection, origin: crs.origin, per_metre: crs.per_metre })
+    }
+
+    /// Longitude, from -180 to 180, and latitude in degrees of a place in the frame's metres.
+    pub(super) fn lonlat(&self, place: DVec3) -> Option<[f64; 2]> {
+        let [x, y] = [0, 1].map(|i| self.origin[i] + place[i] * self.per_metre[i]);
+        let (lon, lat) = self.projection.inverse(x, y)?;
+        let lon = if (-180.0..=180.0).contains(&lon) { lon } else { (lon + 180.0).rem_euclid(360.0) - 180.0 };
+        Some([lon, lat])
+    }
+}
+
+/// The ground between the last two marks.
+#[derive(Debug, Default)]
+pub(super) struct Profile {
+    ends: Option<[DVec3; 2]>,
+    /// The height at places evenly spread from the first to the last, in metres; `None` where there is no ground.
+    heights: Vec<Option<f64>>,
+    /// Whether it shows all that was asked for, and frames since it was looked at.
+    is_final: bool,
+    age: u32,
+}
+
+impl Profile {
+    /// The heights, evenly spread.
+    #[cfg(test)]
+    pub(super) fn heights(&self) -> &[Option<f64>] {
+        &self.heights
+    }
+
+    /// Metres from the first place to the last, over the ground: each step counts as long as it is.
+    fn length(&self) -> f64 {
+        let Some([first, last]) = self.ends else { return 0.0 };
+        let step = (last - first).truncate().length() / (self.heights.len().max(2) - 1) as f64;
+        let rises = self.heights.windows(2).map(|pair| match pair {
+            [Some(a), Some(b)] => b - a,
+            _ => 0.0,
+        });
+        rises.map(|rise| rise.hypot(step)).sum()
+    }
+}
+
+/// Looks at the ground between the last two marks, where there are two and something may have changed.
+pub(super) fn follow(viewer: &mut Viewer) {
+    let [first, last] = viewer.marks[..] else {
+        viewer.profile = Profile::default();
+        return;
+    };
+    let ends = Some([first.place, last.place]);
+    let profile = &mut viewer.profile;
+    profile.age += 1;
+    let is_new = profile.ends != ends;
+    let is_due = !profile.is_final && (viewer.frame.complete || profile.age >= FRAMES);
+    if !is_new && !is_due {
+        return;
+    }
+    let (layers, exaggeration) = (&viewer.terrain.scene().layers, viewer.look.exaggeration);
+    let heights = (0..=SAMPLES).map(|i| {
+        let place = first.place.lerp(last.place, i as f64 / SAMPLES as f64).truncate();
+        Some(viewer.picker.ground(layers, &viewer.frame.items, exaggeration, place)? / exaggeration)
+    });
+    let heights = heights.collect();
+    viewer.profile = Profile { ends, heights, is_final: viewer.frame.complete, age: 0 };
+}
+
+/// What was clicked, in the panel.
+pub(super) fn show(viewer: &Viewer, ui: &mut Ui) {
+    let row = |ui: &mut Ui, mark: &Mark| {
+        let error = mark.error.map_or(String::new(), |error| format!(" ± {error:.1}"));
+        ui.monospace(format!("{:.1}, {:.1}", mark.place.x, mark.place.y));
+        if let Some([lon, lat]) = mark.lonlat {
+            ui.monospace(degrees(lon, lat));
+        }
+        let layer = &viewer.terrain.scene().layers[mark.layer].name;
+        ui.monospace(format!("height {:.1}{error} m, {layer}", mark.place.z));
+    };
+    match viewer.marks() {
+        [] => {
+            ui.label(RichText::new("Click the ground for its height, twice for a profile.").weak());
+        }
+        [one] => row(ui, one),
+        [first, last, ..] => {
+            row(ui, first);
+            row(ui, last);
+            let by = last.place - first.place;
+            ui.monospace(format!("{:.1} m apart on the level, {:+.1} m up", by.truncate().length(), by.z));
+            ui.monospace(format!("{:.1} m over the ground", viewer.profile.length()));
+            plot(&viewer.profile, ui);
+        }
+    }
+}
+
+/// Degrees as maps write them, to about a decimetre.
+fn degrees(lon: f64, lat: f64) -> String {
+    let [east, north] = [if lon < 0.0 { 'W' } else { 'E' }, if lat < 0.0 { 'S' } else { 'N' }];
+    format!("{:.6}° {north}, {:.6}° {east}", lat.abs(), lon.abs())
+}
+
+/// The profile, from the first mark at the left to the last.
+fn plot(profile: &Profile, ui: &mut Ui) {
+    let size = egui::vec2(ui.available_width(), 90.0);
+    let (rect, response) = ui.allocate_exact_size(size, egui::Sense::hover());
+    let painter = ui.painter_at(rect);
+    painter.rect_filled(rect, 3.0, ui.visuals().extreme_bg_color);
+    let known = || profile.heights.iter().flatten().copied();
+    let (low, high) = (known().fold(f64::INFINITY, f64::min), known().fold(f64::NEG_INFINITY, f64::max));
+    if low > high {
+        return;
+    }
+    let (steps, range) = (profile.heights.len().max(2) - 1, (high - low).max(1e-9));
+    #[allow(clippy::cast_possible_truncation, reason = "for a plot")]
+    let at = |i: usize, height: f64| {
+        let x = rect.left() + rect.width() * i as f32 / steps as f32;
+        egui::pos2(x, rect.bottom() - 6.0 - ((height - low) / range) as f32 * (rect.height() - 24.0))
+    };
+    let stroke = Stroke::new(1.4, ui.visuals().hyperlink_color);
+    // In runs: where there is no ground there is a gap.
+    let heights: Vec<(usize, Option<f64>)> = profile.heights.iter().copied().enumerate().collect();
+    for run in heights.split(|(_, height)| height.is_none()) {
+        let points = run.iter().filter_map(|(i, height)| Some(at(*i, (*height)?)));
+        painter.line(points.collect(), stroke);
+    }
+    let (font, colour) = (FontId::proportional(10.0), ui.visuals().weak_text_color());
+    let corner = |align: Align2, text: String| {
+        let place = align.pos_in_rect(&rect.shrink2(egui::vec2(4.0, 1.0)));
+        painter.text(place, align, text, font.clone(), colour);
+    };
+    corner(Align2::LEFT_TOP, format!("{high:.1} m"));
+    corner(Align2::LEFT_BOTTOM, format!("{low:.1} m"));
+    if let (Some(pointer), Some([first, last])) = (response.hover_pos(), profile.ends) {
+        let part = f64::from(((pointer.x - rect.left()) / rect.width()).clamp(0.0, 1.0));
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "from 0 to 1 of so many steps")]
+        let i = (part * steps as f64).round() as usize;
+        if let Some(Some(height)) = profile.heights.get(i) {
+            painter.circle_filled(at(i, *height), 3.0, ui.visuals().strong_text_color());
+            let along = (last - first).truncate().length() * part;
+            corner(Align2::RIGHT_TOP, format!("{height:.1} m after {along:.0} m"));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diamantina_protocol::message::Crs;
+
+    #[test]
+    fn places_have_longitudes_where_the_frame_has() {
+        let crs = |proj4: &str, per_metre| Crs {
+            name: "made".into(),
+            proj4: Some(proj4.into()),
+            origin: [500_000.0, 5_000_000.0],
+            per_metre: [per_metre; 2],
+        };
+        let frame = |crs| Frame { crs, vertical_unit: "metre".into() };
+        assert!(Globe::of(&frame(None)).is_none());
+        assert!(Globe::of(&frame(Some(crs("+proj=nonsense", 1.0)))).is_none());
+        // The central meridian of zone 32.
+        let globe = Globe::of(&frame(Some(crs("+proj=utm +zone=32 +datum=WGS84", 1.0)))).unwrap();
+        let [lon, lat] = globe.lonlat(DVec3::ZERO).unwrap();
+        assert!((lon - 9.0).abs() < 1e-9 && (45.0..45.3).contains(&lat), "{lon} {lat}");
+        assert_eq!(degrees(-9.5, -45.25), "45.250000° S, 9.500000° W");
+    }
+
+    #[test]
+    fn the_way_over_the_ground_is_longer_than_the_level_one() {
+        let ends = Some([DVec3::ZERO, DVec3::new(200.0, 0.0, 0.0)]);
+        let of = |heights: Vec<Option<f64>>| Profile { ends, heights, ..Profile::default() }.length();
+        assert_eq!(of(vec![Some(5.0); 3]), 200.0);
+        // 3, 4, 5: a hundred metres on the level and 75 up.
+        assert_eq!(of(vec![Some(0.0), Some(75.0), Some(0.0)]), 250.0);
+        assert_eq!(of(vec![Some(0.0), None, Some(75.0)]), 200.0);
+    }
+}

@@ -1,0 +1,86 @@
+//! The fuzzer's seeds, and inputs like them, given to every decoder: what it once found stays mended.
+
+#[path = "../fuzz/src/lib.rs"]
+mod targets;
+
+use std::path::Path;
+
+type Target = (&'static str, fn(&[u8]));
+
+const TARGETS: [Target; 8] = [
+    ("batch_query", targets::batch_query::run),
+    ("frames", targets::frames::run),
+    ("index_page", targets::index_page::run),
+    ("points", targets::points::run),
+    ("scene", targets::scene::run),
+    ("stream_query", targets::stream_query::run),
+    ("tin", targets::tin::run),
+    ("zone", targets::zone::run),
+];
+
+/// Inputs made of each seed.
+const VARIANTS: u32 = 400;
+
+/// Numbers that look random, the same every time (xorshift).
+struct Dice(u64);
+
+impl Dice {
+    fn below(&mut self, limit: usize) -> usize {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        usize::try_from(self.0 % limit.max(1) as u64).unwrap()
+    }
+
+    fn byte(&mut self) -> u8 {
+        self.below(256).to_le_bytes()[0]
+    }
+}
+
+/// The seed with a few bytes changed, put in, taken out, or its end cut off.
+fn varied(seed: &[u8], dice: &mut Dice) -> Vec<u8> {
+    let mut bytes = seed.to_vec();
+    for _ in 0..=dice.below(4) {
+        let at = dice.below(bytes.len());
+        match dice.below(5) {
+            0 => bytes.insert(at, dice.byte()),
+            1 if !bytes.is_empty() => drop(bytes.remove(at)),
+            2 => bytes.truncate(at),
+            3 if !bytes.is_empty() => bytes[at] ^= 1 << dice.below(8),
+            _ if !bytes.is_empty() => bytes[at] = dice.byte(),
+            _ => bytes.push(dice.byte()),
+        }
+    }
+    bytes
+}
+
+#[test]
+fn every_decoder_stands_its_seeds_and_what_is_like_them() {
+    let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/corpus");
+    for (name, run) in TARGETS {
+        let mut seeds: Vec<_> = std::fs::read_dir(corpus.join(name))
+            .unwrap_or_else(|e| panic!("{name}: {e}"))
+            .map(|entry| entry.unwrap().path())
+            .filter(|path| path.file_name().is_some_and(|n| n.to_string_lossy().starts_with("seed-")))
+            .collect();
+        seeds.sort();
+        assert!(seeds.len() >= 2, "{name}: expected seeds, found {seeds:?}");
+        for path in seeds {
+            let seed = std::fs::read(&path).unwrap();
+            run(&seed);
+            let mut dice = Dice(0x9E37_79B9_7F4A_7C15);
+            for _ in 0..VARIANTS {
+                run(&varied(&seed, &mut dice));
+            }
+        }
+    }
+}
+
+#[test]
+fn every_target_is_tried_here() {
+    let targets = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/fuzz_targets");
+    for entry in std::fs::read_dir(targets).unwrap() {
+        let name = entry.unwrap().file_name().into_string().unwrap();
+        assert!(TARGETS.iter().any(|(known, _)| name == format!("{known}.rs")), "{name}");
+    }
+}
