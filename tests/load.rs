@@ -18,6 +18,7 @@ fn options(users: u32) -> Options {
         size: [320, 180],
         tolerance_pixels: 2.0,
         memory_bytes: 64 << 20,
+        layers: None,
         encoding: Encoding::Points,
         requests_max: 4,
         http2: false,
@@ -46,8 +47,7 @@ fn users_of_a_server_by_itself_find_all_they_want() {
 #[test]
 fn triangles_load_a_server_as_well() {
     let world = World::whole_with_triangles(257);
-    let report =
-        load(&world.served.scene("world"), &Options { encoding: Encoding::Tin, ..options(6) });
+    let report = load(&world.served.scene("world"), &Options { encoding: Encoding::Tin, ..options(6) });
     assert!(report.errors.is_empty() && report.views.count > 0 && report.decoded.0 > 0, "{report:?}");
 }
 

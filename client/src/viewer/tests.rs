@@ -271,6 +271,6 @@ fn a_frozen_cut_stays_while_the_eye_moves() {
     assert_eq!(items(&hand.viewer), before);
     hand.viewer.frozen = None;
     assert_ne!(items(&hand.viewer), before);
-    hand.viewer.visible[0] = false;
+    hand.viewer.terrain.set_shown(0, false);
     assert!(hand.viewer.items().is_empty());
 }
