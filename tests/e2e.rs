@@ -21,8 +21,12 @@ mod heights;
 mod hostile;
 /// What the server answers to whom: routes, caches, refusals, heights.
 mod http;
+/// Several layers in one scene: built, resumed, served, drawn, refused.
+mod layers;
 /// Who asks too much, too slowly or for nothing does not disturb the others.
 mod limits;
+/// The seeds of the fuzzer, for every decoder.
+mod corpora;
 /// A slow and distant link, and that it is as slow and distant as asked.
 mod link;
 /// Many users at once.

@@ -74,7 +74,7 @@ pub(crate) fn server(folder: &Path, text: &str) -> Ended {
     end(start(&programs().server, &words(folder, text)))
 }
 
-fn client(folder: &Path, text: &str) -> Ended {
+pub(crate) fn client(folder: &Path, text: &str) -> Ended {
     end(start(&programs().client, &words(folder, text)))
 }
 

@@ -19,10 +19,10 @@ use std::sync::Arc;
 const IMMUTABLE: &str = "public, max-age=31536000, immutable";
 
 /// An answer with all its bytes.
-struct Answer {
-    status: StatusCode,
+pub(crate) struct Answer {
+    pub(crate) status: StatusCode,
     headers: HeaderMap,
-    body: Vec<u8>,
+    pub(crate) body: Vec<u8>,
 }
 
 impl Answer {
@@ -30,7 +30,7 @@ impl Answer {
         self.headers.get(name).map_or("", |v| v.to_str().unwrap())
     }
 
-    fn json(&self) -> serde_json::Value {
+    pub(crate) fn json(&self) -> serde_json::Value {
         serde_json::from_slice(&self.body).unwrap()
     }
 }
@@ -46,11 +46,11 @@ async fn ask(method: Method, url: &str, headers: &[(HeaderName, &str)]) -> Answe
     Answer { status, headers, body: response.bytes().await.unwrap().to_vec() }
 }
 
-async fn get(url: &str) -> Answer {
+pub(crate) async fn get(url: &str) -> Answer {
     ask(Method::GET, url, &[]).await
 }
 
-fn block<T>(future: impl Future<Output = T>) -> T {
+pub(crate) fn block<T>(future: impl Future<Output = T>) -> T {
     tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap().block_on(future)
 }
 

@@ -18,6 +18,7 @@ fn options(users: u32) -> Options {
         size: [320, 180],
         tolerance_pixels: 2.0,
         memory_bytes: 64 << 20,
+        layers: None,
         encoding: Encoding::Points,
         requests_max: 4,
         http2: false,

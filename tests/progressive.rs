@@ -268,7 +268,7 @@ fn every_prefix_is_within_the_error_that_it_declares_of_every_sample() {
 #[test]
 fn every_prefix_covers_the_forest_once_without_cracks() {
     let place = archipelago(0.0);
-    let Loaded { layer, entries, surfaces } = seams::load(&place.store);
+    let Loaded { layer, entries, surfaces } = seams::load(&place.store, 0);
     let [low, high] = [layer.position([0, 0]), layer.position(layer.forest.size())];
     let eye = DVec3::new((low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, 60_000.0);
     let camera = Camera { eye, target: eye - DVec3::Z, fov_y: 2.7, size: [1380, 768] };

@@ -80,7 +80,7 @@ impl Unbroken {
 }
 
 /// The files of a store that nobody writes any more.
-fn finished(store: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+pub(crate) fn finished(store: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     assert!(!store.join(".building").exists(), "the work folder is still there");
     let mut all = files(store);
     all.retain(|path, _| path != Path::new(".lock"));

@@ -47,9 +47,10 @@ pub(crate) struct Loaded {
     pub(crate) surfaces: HashMap<Diamond, Arc<Surface>>,
 }
 
-pub(crate) fn load(store: &Store) -> Loaded {
-    let layer = store.scene().layers[0].clone();
-    let entries = inspect::entries(store, 0, &layer).unwrap();
+/// The layer at a position of the scene.
+pub(crate) fn load(store: &Store, number: u8) -> Loaded {
+    let layer = store.scene().layers[usize::from(number)].clone();
+    let entries = inspect::entries(store, number, &layer).unwrap();
     let mut surfaces: HashMap<Diamond, Arc<Surface>> = HashMap::new();
     let forest = layer.forest;
     for d in (0..forest.levels()).flat_map(|level| forest.diamonds(level)) {
@@ -57,7 +58,7 @@ pub(crate) fn load(store: &Store) -> Loaded {
             continue;
         }
         let [a, b] = d.centre();
-        let payload = store.get(Key { layer: 0, kind: Kind::Points, a, b }).unwrap().unwrap_or_default();
+        let payload = store.get(Key { layer: number, kind: Kind::Points, a, b }).unwrap().unwrap_or_default();
         // Parents are saturated, so whatever has a height has parents that have.
         let parents: Vec<_> = forest.parents(d).map(|p| (p, Arc::clone(&surfaces[&p]))).collect();
         let parents: Vec<_> = parents.iter().map(|(p, s)| (*p, s.as_ref())).collect();
@@ -139,7 +140,7 @@ fn any_cut_of_a_built_store_with_anything_missing_has_no_cracks() {
     for (patch_log2, max_error) in [(5, 0.0), (5, 2.0), (6, 1.0)] {
         let store = folder.path().join(format!("store-{patch_log2}-{max_error}"));
         build(&dem, &store, &ingest, &hierarchy::Options { max_error, patch_log2, ..options() });
-        let Loaded { layer, entries, surfaces } = load(&Store::open(&store).unwrap());
+        let Loaded { layer, entries, surfaces } = load(&Store::open(&store).unwrap(), 0);
         let forest = layer.forest;
         assert!(forest.roots()[0] >= 4, "several roots");
         // Saturation reaches a root square's width beyond the last height, so the fourth is the first empty one.

@@ -38,8 +38,9 @@ const SERVER: &[(&str, &[&str])] = &[
     ("size", &[]),
     ("http", &["height", "inspect", "size", "store", "stream"]),
     ("settings", &["http", "size"]),
-    // What the program prints.
-    ("print", &[]),
+    // What the program is told of layers, and what it prints.
+    ("layer_args", &[]),
+    ("print", &["layer_args"]),
     ("sample", &[]),
     ("client_program", &[]),
     ("demo", &["client_program", "hierarchy", "http", "ingest", "progress", "sample"]),

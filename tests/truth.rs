@@ -223,9 +223,14 @@ struct Case<'a> {
     rule: Rule,
 }
 
-/// Compares every diamond of every level with the samples.
-fn judge(store: &Store, entries: &HashMap<Diamond, Entry>, samples: &Samples) -> Verdict {
-    let layer = &store.scene().layers[0];
+/// Compares every diamond of every level of a layer with its samples.
+pub(crate) fn judge(
+    store: &Store,
+    number: u8,
+    entries: &HashMap<Diamond, Entry>,
+    samples: &Samples,
+) -> Verdict {
+    let layer = &store.scene().layers[usize::from(number)];
     let verdict = Verdict::default();
     let check = Check { layer, forest: layer.forest, samples, entries, verdict: &verdict };
     for root in layer.forest.root_diamonds().filter(|root| entries[root].is_empty()) {
@@ -236,7 +241,7 @@ fn judge(store: &Store, entries: &HashMap<Diamond, Entry>, samples: &Samples) ->
             verdict.wrong(|| format!("a sample at {x}, {y} in root {root:?}, said to be empty"));
         }
     }
-    inspect::decode_levels(store, 0, layer, entries, |_, blocks| {
+    inspect::decode_levels(store, number, layer, entries, |_, blocks| {
         blocks.par_iter().for_each(|(d, block, _)| check.split(*d, block));
     })
     .unwrap();
@@ -274,7 +279,7 @@ fn check(case: &Case<'_>, samples: &Samples) {
         layer.quantum
     );
     let entries = inspect::entries(&store, 0, layer).unwrap();
-    let verdict = judge(&store, &entries, samples);
+    let verdict = judge(&store, 0, &entries, samples);
     let compared = verdict.compared.load(Ordering::Relaxed);
     let line = format!(
         "{name}: {compared} comparisons in {} levels, {:.1} s to build, {:.1} s to check",
@@ -390,10 +395,10 @@ fn an_error_declared_a_tenth_too_small_would_be_found_at_every_level() {
     let samples = Samples::read(&ingest::open(&[dem], &ingest).unwrap());
     let store = Store::open(&store).unwrap();
     let entries = inspect::entries(&store, 0, &store.scene().layers[0]).unwrap();
-    assert_eq!(judge(&store, &entries, &samples).wrong.into_inner(), 0);
+    assert_eq!(judge(&store, 0, &entries, &samples).wrong.into_inner(), 0);
     for level in 1..store.scene().layers[0].forest.levels() {
         let mut less = entries.clone();
         less.iter_mut().filter(|(d, _)| d.level() == level).for_each(|(_, e)| e.error_metres *= 0.9);
-        assert!(judge(&store, &less, &samples).wrong.into_inner() > 0, "level {level}");
+        assert!(judge(&store, 0, &less, &samples).wrong.into_inner() > 0, "level {level}");
     }
 }

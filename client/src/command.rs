@@ -97,6 +97,9 @@ struct ViewArgs {
     /// How diamonds are encoded: points take the fewest bytes, tin draws the fewest triangles
     #[arg(long, default_value = "points", value_enum)]
     encoding: EncodingName,
+    /// Stream and draw these layers alone [default: all]
+    #[arg(long = "layer", value_name = "NAME", value_delimiter = ',')]
+    layers: Option<Vec<String>>,
     /// Ask for less where nothing is seen from this zone, while the eye is in it: errors in pixels, those reported
     /// too, then count for what is seen of them
     #[arg(long, value_name = "NAME")]
@@ -260,13 +263,14 @@ impl ViewArgs {
                 token: self.token.token.as_deref().map(Into::into),
                 ..fetch::Options::default()
             },
+            layers: self.layers.clone(),
             zone: self.zone.clone(),
             ..terrain::Options::default()
         };
         Terrain::open(&self.url, options).map_err(|error| {
             let wrong_use = matches!(
                 error,
-                TerrainError::Fetch(FetchError::Address { .. })
+                TerrainError::Fetch(FetchError::Address { .. } | FetchError::Layer { .. })
                     | TerrainError::Zone { .. }
                     | TerrainError::Still
             );
@@ -300,7 +304,7 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
         }
         _ => {
             if args.stream {
-                let wide = headless::stretched_overview(terrain.scene(), size, exaggeration);
+                let wide = headless::stretched_overview(&terrain.shown_scene(), size, exaggeration);
                 headless::stream(&mut terrain, &wide, exaggeration);
             }
             headless::framed(&mut terrain, size, exaggeration, patience)
@@ -431,7 +435,7 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
     }
     let path = args.path.as_deref().map(FlightPath::read).transpose()?;
     let mut terrain = args.view.open(args.morph)?;
-    let path = path.unwrap_or_else(|| FlightPath::round(terrain.scene()));
+    let path = path.unwrap_or_else(|| FlightPath::round(&terrain.shown_scene()));
     let mut csv = args.csv.as_deref().map(headless::open_text).transpose()?;
     if let Some(out) = &mut csv {
         writeln!(out, "{}", FrameLine::HEADING)?;

@@ -76,7 +76,7 @@ pub fn stream(terrain: &mut Terrain, camera: &Camera, exaggeration: f64) {
 /// As [`overview`], but as near as the terrain itself allows, which may be less than its box: waits for a
 /// coarse form of it. Heights are multiplied by `exaggeration` to find the camera, but its own are not.
 pub fn framed(terrain: &mut Terrain, size: [u32; 2], exaggeration: f64, patience: Duration) -> Camera {
-    let camera = stretched_overview(terrain.scene(), size, exaggeration);
+    let camera = stretched_overview(&terrain.shown_scene(), size, exaggeration);
     let wide = stretched(&camera, exaggeration);
     terrain.set_exaggeration(exaggeration);
     let until = Instant::now() + patience;

@@ -16,6 +16,7 @@
 
 mod decoders;
 mod reload;
+mod shown;
 
 use crate::cache::{Cache, Index, Key, PAGES_MAX};
 use crate::camera::{Camera, Plane};
@@ -70,6 +71,8 @@ pub struct Options {
     pub memory_bytes: usize,
     /// Seconds that points take to move from one cut to the next, at most [`morph::SECONDS_MAX`]; 0: they jump.
     pub morph_seconds: f64,
+    /// The names of the layers to stream and draw; none: all.
+    pub layers: Option<Vec<String>>,
     /// The name of a zone: while the eye is in it, less is asked for where nothing is seen from there.
     pub zone: Option<String>,
     /// How to fetch, and in which encoding.
@@ -84,6 +87,7 @@ impl Default for Options {
             sight: Sight::default(),
             memory_bytes: 512 << 20,
             morph_seconds: 0.0,
+            layers: None,
             zone: None,
             fetch: fetch::Options::default(),
         }
@@ -273,6 +277,8 @@ struct LayerState {
     /// What the cut may take of the memory.
     memory_bytes: usize,
     morphs: Morphs,
+    /// Whether it is streamed and drawn.
+    shown: bool,
 }
 
 impl Terrain {
@@ -309,6 +315,7 @@ impl Terrain {
                 asked: encoding.name(),
             });
         }
+        fetch::check_layers(&scene, options.layers.as_deref().unwrap_or_default())?;
         let view = match options.zone.as_deref() {
             Some(name) => {
                 let zone = ZoneView::find(&scene, name)?;
@@ -316,18 +323,19 @@ impl Terrain {
             }
             None => None,
         };
-        let share = options.memory_bytes / scene.layers.len() / 4 * 3;
         let state = |layer: &Layer| LayerState {
             index: Index::new(layer.forest),
             ideal: Ideal::default(),
-            memory_bytes: share,
+            memory_bytes: 0,
             morphs: Morphs::new(options.morph_seconds),
+            shown: true,
         };
         let layers = scene.layers.iter().map(state).collect();
         let forests = scene.layers.iter().map(|layer| layer.forest).collect();
         let cache = Cache::new(forests, options.memory_bytes);
         let scene = Arc::new(scene);
-        Ok(Self {
+        let shown = options.layers.clone();
+        let mut terrain = Self {
             url: fetcher.address(),
             layers,
             cache,
@@ -348,7 +356,9 @@ impl Terrain {
             planes: None,
             stats: Stats::default(),
             view,
-        })
+        };
+        terrain.show_only(shown);
+        Ok(terrain)
     }
 
     /// The scene's description.
@@ -426,7 +436,7 @@ impl Terrain {
         let sides = camera.planes().iter().map(flat).collect();
         let eye = camera.eye.with_z(camera.eye.z / exaggeration).to_array();
         let view = StreamView { eye, angle, sides, vertical: self.options.sight.vertical };
-        for layer in 0..self.layers.len() {
+        for layer in (0..self.layers.len()).filter(|layer| self.layers[*layer].shown) {
             self.fetcher.stream(layer, StreamAsk { view: Some(view.clone()), ..StreamAsk::default() });
         }
         self.strays = 0;
@@ -465,7 +475,7 @@ impl Terrain {
         let zone = self.view.as_ref().filter(|view| view.zone.contains(eye.to_array()));
         self.stats.zone_in_effect = zone.is_some();
         let tolerance = self.options.tolerance_pixels / camera.pixels_per_radian();
-        for (number, state) in self.layers.iter_mut().enumerate() {
+        for (number, state) in self.layers.iter_mut().enumerate().filter(|(_, state)| state.shown) {
             let ask = Ask {
                 layer: &self.scene.layers[number],
                 encoding: self.options.fetch.encoding,

@@ -2,7 +2,7 @@
 //!
 //! The page is that of a server: its address, `?scene=NAME`, says what to open; `#x,y,z,heading,pitch` where to begin,
 //! and follows the view, so that it can be kept, sent and opened again, in a native window too. Further words of the
-//! query: `error=PIXELS`, `encoding=points|tin`, `zone=NAME`, `graphics=webgl` (where WebGPU is there, but does not work).
+//! query: `error=PIXELS`, `encoding=points|tin`, `zone=NAME`, `layer=NAME,NAME` (those alone), `graphics=webgl` (where WebGPU is there, but does not work).
 //!
 //! What the page shows besides the canvas, it shows by its own means: see `web/` beside this crate.
 
@@ -112,6 +112,7 @@ fn options(address: &Address) -> Result<terrain::Options, String> {
         tolerance_pixels,
         memory_bytes: MEMORY_BYTES,
         morph_seconds: if encoding == Encoding::Points { MORPH_SECONDS } else { 0.0 },
+        layers: address.asked("layer").map(|names| names.split(',').map(str::to_owned).collect()),
         zone: address.asked("zone"),
         fetch: fetch::Options { encoding, ..fetch::Options::default() },
         ..terrain::Options::default()

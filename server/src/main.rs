@@ -1,9 +1,10 @@
 //! The command line of the server.
 
+mod layer_args;
 mod print;
 
 use clap::{ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
-use diamantina_protocol::message::{Kind, is_name};
+use diamantina_protocol::message::is_name;
 use diamantina_protocol::points::Rule;
 use diamantina_server::experiment::ExperimentError;
 use diamantina_server::hierarchy::{self, BuildError, TinOptions};
@@ -17,6 +18,7 @@ use diamantina_server::tin::Metric;
 use diamantina_server::zone::polygon::Coordinates;
 use diamantina_server::zone::{self, ZoneError};
 use diamantina_server::{curve, demo, experiment, http, ingest};
+use layer_args::{LayerArg, Layers};
 use std::io::{IsTerminal, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -62,10 +64,15 @@ enum Command {
 
 #[derive(Args)]
 struct BuildArgs {
-    /// DEM files of one layer: GeoTIFF, .hgt, Arc ASCII, USGS DEM or PNG, also in a .gz, or alone in a .zip; raw,
-    /// also in a .gz
-    #[arg(required = true, value_name = "DEM")]
+    /// DEM files of the layer "terrain": GeoTIFF, .hgt, Arc ASCII, USGS DEM or PNG, also in a .gz, or alone in a .zip;
+    /// raw, also in a .gz
+    #[arg(required_unless_present = "layers", value_name = "DEM")]
     sources: Vec<PathBuf>,
+    /// Another layer: NAME=terrain:DEM or NAME=water:DEM (there is water where the file has heights), or flat water over
+    /// the first terrain: NAME=water:level=METRES. Said again with the same name it adds a file. The first layer decides
+    /// the frame, to which others are resampled; what is said of files holds for those of all layers
+    #[arg(long = "layer", id = "layers", value_name = "NAME=KIND:DEM")]
+    layers: Vec<LayerArg>,
     /// The folder of the store, or the address of an object store (s3://BUCKET/PREFIX, gs://..., az://...); an older
     /// scene there is replaced once the new one is complete
     #[arg(short, long, value_name = "STORE")]
@@ -418,8 +425,6 @@ fn build(args: &BuildArgs) -> Result<(), Failure> {
     }
     let options = hierarchy::Options {
         scene: scene_name(args.scene.clone(), &args.output)?,
-        layer: "terrain".to_owned(),
-        kind: Kind::Terrain,
         max_error: args.max_error,
         rule: match args.rule {
             RuleName::Midpoint => Rule::Midpoint,
@@ -445,14 +450,23 @@ fn build(args: &BuildArgs) -> Result<(), Failure> {
         fresh: args.fresh,
         checkpoint: Duration::from_secs(args.checkpoint),
     };
-    let source = ingest::open(&args.sources, &args.ingest).map_err(|e| refuse_build(&[], &e.into()))?;
+    let layers = layer_args::join(&args.sources, &args.layers).map_err(|e| Failure(2, e))?;
+    // Flat water has as many cells as the least forest.
+    let layers = Layers::open(layers, &args.ingest, options.patch_log2 + 1)
+        .map_err(|e| refuse_build(None, &e.into()))?;
+    for name in layers.apart() {
+        let words =
+            "does not touch the first layer: are both files in the systems of coordinates that they name?";
+        let _ = writeln!(std::io::stderr(), "notice: layer '{name}' {words}");
+    }
     if args.dry_run {
-        let estimate = hierarchy::estimate(&source, &options).map_err(|e| refuse_build(&args.sources, &e))?;
+        let estimates =
+            hierarchy::estimate(&layers.sources(), &options).map_err(|e| refuse_build(Some(&layers), &e))?;
         let mut out = std::io::stdout().lock();
         if args.json {
-            writeln!(out, "{}", serde_json::to_string_pretty(&estimate)?)?;
+            writeln!(out, "{}", serde_json::to_string_pretty(&estimates)?)?;
         } else {
-            print::estimate(&mut out, &args.output, &estimate)?;
+            print::estimates(&mut out, &args.output, &estimates)?;
         }
         return Ok(());
     }
@@ -464,8 +478,8 @@ fn build(args: &BuildArgs) -> Result<(), Failure> {
         .unwrap_or_default();
     let progress = Arc::new(Progress::new());
     stop_on_signals(&progress)?;
-    let report =
-        hierarchy::build(&source, built, &options, &progress).map_err(|e| refuse_build(&args.sources, &e))?;
+    let report = hierarchy::build_layers(&layers.sources(), built, &options, &progress)
+        .map_err(|e| refuse_build(Some(&layers), &e))?;
     if let Some(upload) = &upload {
         send(&upload.publisher, built, &args.output, false, &progress)?;
         if args.work.is_none() {
@@ -584,21 +598,27 @@ fn stop_on_signals(progress: &Arc<Progress>) -> std::io::Result<()> {
 }
 
 /// Options that make no sense, or not for this source, are wrong use; all else is failure.
-fn refuse_build(sources: &[PathBuf], error: &BuildError) -> Failure {
+fn refuse_build(layers: Option<&Layers>, error: &BuildError) -> Failure {
+    let cause = error.cause();
     let wrong_use = matches!(
-        error,
+        cause,
         BuildError::MaxError { .. }
             | BuildError::Quantum(_)
             | BuildError::Memory { .. }
             | BuildError::PatchErrorMemory { .. }
             | BuildError::TinOption { .. }
+            | BuildError::Layers(_)
             | BuildError::Store(StoreError::Foreign { .. })
             | BuildError::Ingest(IngestError::Options { .. })
     );
     // What the heights themselves are to blame for names where they came from.
-    let about_heights = matches!(error, BuildError::AllNodata(_) | BuildError::Range { .. });
-    let names: Vec<String> =
-        sources.iter().filter(|_| about_heights).map(|s| s.display().to_string()).collect();
+    let about_heights = matches!(cause, BuildError::AllNodata(_) | BuildError::Range { .. });
+    let layer = match error {
+        BuildError::Layer { layer, .. } => Some(layer.as_str()),
+        _ => None,
+    };
+    let files = layers.filter(|_| about_heights).map_or(&[][..], |layers| layers.files(layer));
+    let names: Vec<String> = files.iter().map(|file| file.display().to_string()).collect();
     let from = if names.is_empty() { String::new() } else { format!("{}: ", names.join(", ")) };
     let code = match error {
         BuildError::Interrupted { .. } => INTERRUPTED,

@@ -1,21 +1,33 @@
 //! What commands print of their results, for people.
 
+use crate::layer_args::word;
 use diamantina_protocol::message::Layer;
 use diamantina_server::experiment;
-use diamantina_server::hierarchy::{Estimate, Report};
+use diamantina_server::hierarchy::{Estimate, Estimates, LayerReport, Report};
 use diamantina_server::inspect::{Inspection, TinInspection};
 use diamantina_server::zone;
 use std::io::Write;
 use std::path::Path;
 
-pub(super) fn estimate(out: &mut impl Write, store: &Path, e: &Estimate) -> std::io::Result<()> {
+pub(super) fn estimates(out: &mut impl Write, store: &Path, e: &Estimates) -> std::io::Result<()> {
     writeln!(
         out,
         "{}: estimated from {} of {} samples; nothing was written",
         store.display(),
-        e.sampled,
-        e.samples
+        e.all.sampled,
+        e.all.samples
     )?;
+    for layer in e.layers.iter().filter(|_| e.layers.len() > 1) {
+        writeln!(out, "layer {}: {} samples", layer.name, layer.estimate.samples)?;
+        estimate(out, &layer.estimate)?;
+    }
+    if e.layers.len() > 1 {
+        writeln!(out, "all layers, one after the other:")?;
+    }
+    estimate(out, &e.all)
+}
+
+fn estimate(out: &mut impl Write, e: &Estimate) -> std::io::Result<()> {
     writeln!(out, "  {:.1} % nodata", 100.0 * (1.0 - e.valid_samples as f64 / e.samples as f64))?;
     if e.diamonds > 0 || e.triangles == 0 {
         writeln!(
@@ -39,8 +51,18 @@ pub(super) fn estimate(out: &mut impl Write, store: &Path, e: &Estimate) -> std:
 }
 
 pub(super) fn report(out: &mut impl Write, store: &Path, report: &Report) -> std::io::Result<()> {
-    let layer = &report.scene.layers[0];
     writeln!(out, "{}: scene '{}', version {}", store.display(), report.scene.name, report.scene.version)?;
+    for (layer, found) in report.scene.layers.iter().zip(&report.layers) {
+        if report.layers.len() > 1 {
+            writeln!(out, "layer {}: {}", layer.name, word(layer.kind))?;
+        }
+        built(out, layer, found)?;
+    }
+    writeln!(out, "  {:.1} s, {:.2} Msamples/s", report.seconds, report.msamples_per_second)?;
+    writeln!(out, "Next: diamantina-server serve {}", store.display())
+}
+
+fn built(out: &mut impl Write, layer: &Layer, report: &LayerReport) -> std::io::Result<()> {
     writeln!(
         out,
         "  {} x {} samples of {:.3} x {:.3} m, heights {:.3} to {:.3} m, {:.1} % nodata",
@@ -70,8 +92,7 @@ pub(super) fn report(out: &mut impl Write, store: &Path, report: &Report) -> std
             tin.triangles, tin.bytes, tin.finest_error
         )?;
     }
-    writeln!(out, "  {:.1} s, {:.2} Msamples/s", report.seconds, report.msamples_per_second)?;
-    writeln!(out, "Next: diamantina-server serve {}", store.display())
+    Ok(())
 }
 
 pub(super) fn inspection(out: &mut impl Write, i: &Inspection) -> std::io::Result<()> {
@@ -81,8 +102,9 @@ pub(super) fn inspection(out: &mut impl Write, i: &Inspection) -> std::io::Resul
         let [columns, rows] = about.forest.roots();
         writeln!(
             out,
-            "layer {}: {} x {} samples of {:.3} x {:.3} m, {columns} x {rows} roots, quantum {} m, errors {}",
+            "layer {}: {}, {} x {} samples of {:.3} x {:.3} m, {columns} x {rows} roots, quantum {} m, errors {}",
             layer.name,
+            word(about.kind),
             about.samples[0],
             about.samples[1],
             about.cell[0],

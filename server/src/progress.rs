@@ -17,6 +17,8 @@ const PATIENCE: Duration = Duration::from_secs(3);
 #[derive(Debug)]
 pub struct Progress {
     stage: Mutex<Stage>,
+    /// What of several things the next stages are of.
+    of: Mutex<Option<String>>,
     shown: bool,
     /// Whether the log is told.
     told: bool,
@@ -26,7 +28,7 @@ pub struct Progress {
 #[derive(Debug)]
 struct Stage {
     bar: ProgressBar,
-    name: &'static str,
+    name: String,
     unit: &'static str,
     total: u64,
     /// Done before this run.
@@ -53,7 +55,7 @@ impl Progress {
         let now = Instant::now();
         let stage = Stage {
             bar: ProgressBar::hidden(),
-            name: "",
+            name: String::new(),
             unit: "",
             total: 0,
             before: 0,
@@ -61,18 +63,25 @@ impl Progress {
             started: now,
             logged: now,
         };
-        Self { stage: Mutex::new(stage), shown, told, stop: OnceLock::new() }
+        Self { stage: Mutex::new(stage), of: Mutex::default(), shown, told, stop: OnceLock::new() }
+    }
+
+    /// Says which of several things the next stages are of, such as a layer; `None`: of all.
+    pub fn of(&self, thing: Option<&str>) {
+        *self.of.lock().unwrap_or_else(PoisonError::into_inner) = thing.map(str::to_owned);
     }
 
     /// Starts the next stage, of `total` of a `unit` such as samples (0: unknown), `before` of which were
     /// done by an earlier run.
     pub fn stage(&self, name: &'static str, unit: &'static str, total: u64, before: u64) {
+        let of = self.of.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        let name = of.map_or_else(|| name.to_owned(), |thing| format!("{thing}: {name}"));
         let mut stage = self.lock();
         stage.bar.finish_and_clear();
         if self.told {
             tracing::info!(stage = name, total, done = before, unit, "building");
         }
-        let bar = if self.shown { shown_bar(name, unit, total, before) } else { ProgressBar::hidden() };
+        let bar = if self.shown { shown_bar(&name, unit, total, before) } else { ProgressBar::hidden() };
         let now = Instant::now();
         *stage = Stage { bar, name, unit, total, before, done: before, started: now, logged: now };
     }
@@ -133,7 +142,7 @@ impl Progress {
     }
 }
 
-fn shown_bar(name: &'static str, unit: &'static str, total: u64, before: u64) -> ProgressBar {
+fn shown_bar(name: &str, unit: &'static str, total: u64, before: u64) -> ProgressBar {
     let template = "{msg:8} {wide_bar} {percent:>3}% {rate}, {eta} left";
     let rate = move |state: &ProgressState, out: &mut dyn std::fmt::Write| {
         // A bar that cannot be written is no reason to stop.
@@ -144,7 +153,7 @@ fn shown_bar(name: &'static str, unit: &'static str, total: u64, before: u64) ->
         };
     };
     let style = ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
-    let bar = ProgressBar::new(total).with_style(style.with_key("rate", rate)).with_message(name);
+    let bar = ProgressBar::new(total).with_style(style.with_key("rate", rate)).with_message(name.to_owned());
     bar.set_position(before);
     // What was done before says nothing of the rate.
     bar.reset_eta();

@@ -43,6 +43,9 @@ pub(super) struct LoadArgs {
     /// What each user's cache may hold, as a viewer counts it; what several hold is there once
     #[arg(long, default_value = "256", value_name = "MIB")]
     memory: usize,
+    /// Look at these layers alone [default: all]
+    #[arg(long = "layer", value_name = "NAME", value_delimiter = ',')]
+    layers: Option<Vec<String>>,
     /// How diamonds are encoded
     #[arg(long, default_value = "points", value_enum)]
     encoding: EncodingName,
@@ -79,6 +82,7 @@ pub(super) fn run(args: &LoadArgs) -> Result<(), Failure> {
         size: args.size,
         tolerance_pixels: args.error_pixels,
         memory_bytes: args.memory << 20,
+        layers: args.layers.clone(),
         encoding: match args.encoding {
             EncodingName::Points => Encoding::Points,
             EncodingName::Tin => Encoding::Tin,
@@ -108,7 +112,8 @@ pub(super) fn run(args: &LoadArgs) -> Result<(), Failure> {
         let _ = writeln!(std::io::stderr());
     }
     let report = report.map_err(|error| {
-        let is_wrong_use = matches!(error, LoadError::Fetch(FetchError::Address { .. }));
+        let is_wrong_use =
+            matches!(error, LoadError::Fetch(FetchError::Address { .. } | FetchError::Layer { .. }));
         Failure(if is_wrong_use { 2 } else { 1 }, error.to_string())
     })?;
     if let Some(out) = &mut json {

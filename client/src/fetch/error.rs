@@ -91,6 +91,16 @@ pub enum FetchError {
     /// The address names no scene and the server has several, or none.
     #[error("the address names no scene: add /scenes/NAME, with NAME one of: {}", .0.join(", "))]
     Choose(Vec<String>),
+    /// Layers were named, and one is none of the scene's.
+    #[error("scene '{scene}' has no layer '{asked}': it has {}", .layers.join(", "))]
+    Layer {
+        /// The scene's name.
+        scene: String,
+        /// The layer asked for.
+        asked: String,
+        /// The layers that there are.
+        layers: Vec<String>,
+    },
     /// No thread or no HTTP client.
     #[error("cannot start fetching: {0}: close other programs, or raise the limit on threads (ulimit -u)")]
     Start(String),

@@ -155,6 +155,21 @@ impl Traffic {
     }
 }
 
+/// Makes sure that a scene has all layers that are asked for by name.
+///
+/// # Errors
+/// When it has not.
+pub(crate) fn check_layers(scene: &Scene, asked: &[String]) -> Result<(), FetchError> {
+    match asked.iter().find(|name| !scene.layers.iter().any(|layer| layer.name == **name)) {
+        None => Ok(()),
+        Some(unknown) => Err(FetchError::Layer {
+            scene: scene.name.clone(),
+            asked: unknown.clone(),
+            layers: scene.layers.iter().map(|layer| layer.name.clone()).collect(),
+        }),
+    }
+}
+
 /// Fetches a scene. Dropping it drops its requests, without waiting.
 ///
 /// Holds the wishes and, for each request in flight, at most one payload or page beyond what is handed out.

@@ -12,7 +12,7 @@ mod tally;
 mod user;
 
 use crate::encoding::Encoding;
-use crate::fetch::{FetchError, connect, describe, parse_address};
+use crate::fetch::{FetchError, check_layers, connect, describe, parse_address};
 use crate::headless::FlightPath;
 use ledger::Ledger;
 use std::sync::Arc;
@@ -43,6 +43,8 @@ pub struct Options {
     pub tolerance_pixels: f64,
     /// What each user's cache may hold, in bytes as the viewer counts them.
     pub memory_bytes: usize,
+    /// The names of the layers that users look at; none: all.
+    pub layers: Option<Vec<String>>,
     /// How diamonds are encoded.
     pub encoding: Encoding,
     /// Requests that a user has in flight at once.
@@ -85,6 +87,10 @@ pub fn run(url: &str, options: &Options, mut tell: impl FnMut(&Report)) -> Resul
     };
     let root = base.as_str().trim_end_matches('/').to_owned();
     let mut scene = runtime.block_on(describe(client(0)?, &root, name.as_deref()))?;
+    if let Some(names) = &options.layers {
+        check_layers(&scene, names)?;
+        scene.layers.retain(|layer| names.contains(&layer.name));
+    }
     for layer in &mut scene.layers {
         let (name, asked) = (layer.name.clone(), options.encoding.name());
         *layer = options.encoding.layer(layer).ok_or(LoadError::Encoding(name, asked))?;

@@ -372,7 +372,8 @@ impl Renderer {
             .collect();
         draws.sort_by(|a, b| {
             let key = |d: &Draw<'_>| (d.item.layer, d.kind, !d.shares_triangles);
-            key(a).cmp(&key(b)).then(a.distance.total_cmp(&b.distance))
+            let nearest = key(a).cmp(&key(b)).then(a.distance.total_cmp(&b.distance));
+            nearest.then(a.item.diamond.cmp(&b.item.diamond))
         });
         draws
     }

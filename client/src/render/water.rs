@@ -359,13 +359,18 @@ fn draw_sheet(
 
 /// The mean height of what is in view, in metres, stretched: each part counts as large as it looks.
 fn mean_height(draws: &[&Draw<'_>], eye: DVec3) -> f64 {
-    let (mut sum, mut weights) = (0.0, 0.0);
-    for draw in draws {
-        let size = draw.bounds.max - draw.bounds.min;
-        let distance = draw.bounds.distance(eye).max(size.truncate().length()).max(1e-9);
-        let weight = (size.x * size.y).max(1e-9) / (distance * distance);
-        sum += weight * draw.bounds.min.z.midpoint(draw.bounds.max.z);
-        weights += weight;
-    }
+    let mut parts: Vec<_> = draws
+        .iter()
+        .map(|draw| {
+            let size = draw.bounds.max - draw.bounds.min;
+            let distance = draw.bounds.distance(eye).max(size.truncate().length()).max(1e-9);
+            let weight = (size.x * size.y).max(1e-9) / (distance * distance);
+            (draw.item.diamond, weight, draw.bounds.min.z.midpoint(draw.bounds.max.z))
+        })
+        .collect();
+    // Sums depend on the order, if only in their last bits: the same view is the same picture.
+    parts.sort_unstable_by_key(|(diamond, ..)| *diamond);
+    let (sum, weights) =
+        parts.iter().fold((0.0, 0.0), |(sum, weights), (_, w, height)| (sum + w * height, weights + w));
     sum / weights
 }

@@ -26,7 +26,8 @@ pub(super) enum Reload {
 /// Opens a scene in the background. A build drops zones: without the one asked for, all of it counts.
 fn open(url: &str, options: &Options) -> Reload {
     let (sender, receiver) = sync_channel(1);
-    let (url, options) = (url.to_owned(), options.clone());
+    // The other version may have other layers.
+    let (url, options) = (url.to_owned(), Options { layers: None, ..options.clone() });
     let started = aside("diamantina-reload", async move {
         let opened = match Terrain::connect(&url, options.clone()).await {
             Err(TerrainError::Zone { .. }) => Terrain::connect(&url, Options { zone: None, ..options }).await,
@@ -71,6 +72,7 @@ impl Terrain {
         if let Reload::Loading(next) = &mut reload {
             next.options.tolerance_pixels = self.options.tolerance_pixels;
             next.options.exaggeration = self.options.exaggeration;
+            next.show_only(self.options.layers.clone());
             let view = next.draw_at(camera, seconds);
             let is_as_exact = view.error_pixels <= self.error_pixels || view.complete || next.is_stuck();
             if view.error_pixels.is_finite() && is_as_exact {

@@ -453,3 +453,53 @@ fn hostile_triangles_are_refused() {
     assert!(view.items.is_empty(), "{:?}", view.stats);
     assert!(terrain.problem().is_some(), "{:?}", view.stats);
 }
+
+#[test]
+fn a_hidden_layer_is_neither_drawn_nor_fetched_and_comes_back_without_its_neighbour_suffering() {
+    let served = Served::start(2, Faults::default());
+    let layers_of = |view: &FrameView| view.items.iter().map(|item| item.layer).collect::<HashSet<_>>();
+    let both = open(&served, Options::default()).settle(&above(), MINUTE);
+    assert_eq!(layers_of(&both), HashSet::from([0, 1]));
+    // From the beginning: not a byte of it.
+    let alone = Options { layers: Some(vec!["terrain".into()]), ..Options::default() };
+    let mut terrain = open(&served, alone);
+    assert_eq!((terrain.is_shown(0), terrain.is_shown(1), terrain.is_shown(2)), (true, false, false));
+    assert_eq!(terrain.shown_scene().layers.len(), 1);
+    let view = terrain.settle(&above(), MINUTE);
+    assert!(view.complete && view.error_pixels <= 1.0);
+    assert_eq!(layers_of(&view), HashSet::from([0]));
+    assert!(view.stats.traffic.bytes < both.stats.traffic.bytes, "{:?}", view.stats.traffic);
+    assert_eq!(view.items.len(), both.items.iter().filter(|item| item.layer == 0).count());
+    // A stream, too, is of what is shown.
+    let mut streamed = open(&served, Options { layers: Some(vec!["water".into()]), ..Options::default() });
+    streamed.stream(&above());
+    let water = streamed.settle(&above(), MINUTE);
+    assert_eq!((layers_of(&water), water.stats.traffic.requests), (HashSet::from([1]), 2));
+    // Shown, it comes, and all of it.
+    let before = view.stats.traffic.requests;
+    terrain.set_shown(1, true);
+    let view = terrain.settle(&above(), MINUTE);
+    assert_eq!((layers_of(&view), view.items.len()), (HashSet::from([0, 1]), both.items.len()));
+    assert!(view.stats.traffic.requests > before);
+    // Hidden while nothing has arrived yet: nothing more is asked for.
+    terrain.set_shown(0, false);
+    terrain.set_shown(1, false);
+    let none = terrain.settle(&above(), MINUTE);
+    assert!(none.complete && none.items.is_empty() && none.error_pixels == 0.0, "{none:?}");
+    assert_eq!(none.stats.traffic.requests, view.stats.traffic.requests);
+    terrain.set_shown(0, true);
+    let again = terrain.settle(&above(), MINUTE);
+    assert_eq!(layers_of(&again), HashSet::from([0]));
+    assert_eq!(
+        again.stats.traffic.requests, view.stats.traffic.requests,
+        "what is resident is not fetched again"
+    );
+}
+
+#[test]
+fn a_layer_that_the_scene_has_not_is_refused_with_those_it_has() {
+    let served = Served::start(2, Faults::default());
+    let asked = Options { layers: Some(vec!["terrain".into(), "lava".into()]), ..Options::default() };
+    let error = Terrain::open(&served.url, asked).unwrap_err().to_string();
+    assert!(error.contains("no layer 'lava'") && error.contains("terrain, water"), "{error}");
+}

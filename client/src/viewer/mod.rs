@@ -78,8 +78,6 @@ pub struct Viewer {
     home: Camera,
     picker: Picker,
     look: Look,
-    /// Which layers are drawn.
-    visible: Vec<bool>,
     frame: FrameView,
     /// What is drawn while the cut stands still.
     frozen: Option<Vec<DrawItem>>,
@@ -103,10 +101,9 @@ impl Viewer {
     #[must_use]
     pub fn new(mut terrain: Terrain, url: &str, look: Look, size: [u32; 2], camera: Option<Camera>) -> Self {
         terrain.set_exaggeration(look.exaggeration);
-        let home = overview::stretched_overview(terrain.scene(), size, look.exaggeration);
+        let home = overview::stretched_overview(&terrain.shown_scene(), size, look.exaggeration);
         let stretched = |c: Camera| Camera { size, ..overview::stretched(&c, look.exaggeration) };
         let globe = Globe::of(&terrain.scene().frame);
-        let visible = vec![true; terrain.scene().layers.len()];
         Self {
             controls: Controls::new(stretched(camera.unwrap_or(home))),
             home: stretched(home),
@@ -114,7 +111,6 @@ impl Viewer {
             url: url.to_owned(),
             picker: Picker::default(),
             look,
-            visible,
             frame: FrameView::default(),
             frozen: None,
             grabbed: None,
@@ -167,11 +163,11 @@ impl Viewer {
         &self.marks
     }
 
-    /// What to draw: of the layers that are visible, the cut of this frame, or the frozen one.
+    /// What to draw: of the layers that are shown, the cut of this frame, or the frozen one.
     #[must_use]
     pub fn items(&self) -> Vec<DrawItem> {
         let items = self.frozen.as_ref().unwrap_or(&self.frame.items);
-        items.iter().filter(|item| self.visible.get(item.layer) == Some(&true)).cloned().collect()
+        items.iter().filter(|item| self.terrain.is_shown(item.layer)).cloned().collect()
     }
 
     /// What is asked for since the last call.
@@ -259,7 +255,7 @@ impl Viewer {
     fn has_waves(&self) -> bool {
         let water = &self.look.water;
         let layers = &self.terrain.scene().layers;
-        let is_water = |item: &DrawItem| layers[item.layer].kind == Kind::Water && self.visible[item.layer];
+        let is_water = |item: &DrawItem| layers[item.layer].kind == Kind::Water;
         water.reflecting && water.waves > 0.0 && !self.look.wireframe && self.frame.items.iter().any(is_water)
     }
 
@@ -440,7 +436,8 @@ impl Viewer {
     /// Flies to where the whole scene is seen.
     fn frame_scene(&mut self) {
         let camera = self.camera();
-        let whole = overview::stretched_overview(self.terrain.scene(), camera.size, self.look.exaggeration);
+        let whole =
+            overview::stretched_overview(&self.terrain.shown_scene(), camera.size, self.look.exaggeration);
         self.controls.glide_to(overview::stretched(&whole, self.look.exaggeration));
     }
 

@@ -77,8 +77,11 @@ fn scene(viewer: &mut Viewer, ui: &mut Ui) {
     ui.heading(&scene.name);
     ui.label(RichText::new(format!("version {}", scene.version)).weak().small());
     let names: Vec<String> = scene.layers.iter().map(|layer| layer.name.clone()).collect();
-    for (name, visible) in names.iter().zip(&mut viewer.visible) {
-        ui.checkbox(visible, name);
+    for (number, name) in names.iter().enumerate() {
+        let mut shown = viewer.terrain.is_shown(number);
+        if ui.checkbox(&mut shown, name).on_hover_text("What is hidden is not fetched").changed() {
+            viewer.terrain.set_shown(number, shown);
+        }
     }
     ui.horizontal(|ui| {
         if ui.button("Home").on_hover_text("H").clicked() {

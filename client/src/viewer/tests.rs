@@ -271,7 +271,7 @@ fn a_frozen_cut_stays_while_the_eye_moves() {
     assert_eq!(items(&hand.viewer), before);
     hand.viewer.frozen = None;
     assert_ne!(items(&hand.viewer), before);
-    hand.viewer.visible[0] = false;
+    hand.viewer.terrain.set_shown(0, false);
     assert!(hand.viewer.items().is_empty());
 }
 
@@ -340,6 +340,8 @@ fn two_fingers_turn_what_is_between_them() {
     };
     let fingers = |angle: f32| [1.0, -1.0].map(|side| at + side * 60.0 * vec2(angle.cos(), angle.sin()));
     let [a, b] = fingers(0.0);
+    // The first finger is the pointer, too.
+    hand.frame(&[Event::PointerMoved(a)]);
     hand.frame(&[touch(1, egui::TouchPhase::Start, a), touch(2, egui::TouchPhase::Start, b)]);
     for i in 1..=10 {
         let [a, b] = fingers(0.05 * i as f32);

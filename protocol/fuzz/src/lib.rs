@@ -1,5 +1,5 @@
 //! What is asked of each decoder, whatever it is given. The fuzzer asks it of inputs that it makes up, and
-//! `protocol/tests/corpora.rs` of the seeds and of some inputs like them, with every run of the tests.
+//! `tests/corpora.rs` of the seeds and of some inputs like them, with every run of the tests.
 
 pub mod batch_query;
 pub mod frames;

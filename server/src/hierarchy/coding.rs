@@ -199,7 +199,7 @@ impl Build<'_> {
         let mut spot = None;
         if !payload.is_empty() {
             let [a, b] = d.centre();
-            let key = Key { layer: 0, kind: BlobKind::Points, a, b };
+            let key = Key { layer: self.number, kind: BlobKind::Points, a, b };
             spot = Some(self.work.writer.put(key, blob_order(d), &payload)?);
         }
         Ok(Coded::new(d, block, source, spot))

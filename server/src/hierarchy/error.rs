@@ -7,6 +7,7 @@ use diamantina_protocol::bintree::ForestError;
 use diamantina_protocol::message::PAYLOAD_BYTES_MAX;
 use diamantina_protocol::points::{CodingError, SOURCE_MAX};
 use diamantina_protocol::tin::PatchError;
+use diamantina_protocol::zone::LAYERS_MAX;
 use std::io;
 use std::path::PathBuf;
 
@@ -27,6 +28,23 @@ pub enum BuildError {
         /// What the system said.
         error: io::Error,
     },
+    /// What went wrong with one of several layers.
+    #[error("layer '{layer}': {error}")]
+    Layer {
+        /// Its name.
+        layer: String,
+        /// What it was.
+        error: Box<Self>,
+    },
+    /// More than a scene may have.
+    #[error("{0} layers, expected at most {LAYERS_MAX}: build several scenes")]
+    Layers(usize),
+    /// No name, or that of another layer.
+    #[error(
+        "layer '{0}': expected a name that no other layer has, of 1 to 64 letters, digits, '-', '_' or '.', not starting \
+         with '.', and not 'zones'"
+    )]
+    LayerName(String),
     /// Somebody asked for a stop.
     #[error(
         "interrupted: {done} of {chunks} chunks are done; the same command goes on from there (--fresh starts anew)"
@@ -150,9 +168,37 @@ fn work_remedy(error: &io::Error) -> &'static str {
 }
 
 impl BuildError {
+    /// What went wrong, whatever the layer.
+    #[must_use]
+    pub fn cause(&self) -> &Self {
+        match self {
+            Self::Layer { error, .. } => error.cause(),
+            other => other,
+        }
+    }
+
+    /// The same of a layer beside others that take so many bytes, where so many are granted to all.
+    pub(super) fn beside(self, others: u64, asked: u64) -> Self {
+        match self {
+            Self::Memory { needed, .. } => Self::Memory { asked, needed: needed.saturating_add(others) },
+            Self::PatchErrorMemory { side, needed, .. } => {
+                Self::PatchErrorMemory { side, asked, needed: needed.saturating_add(others) }
+            }
+            other => other,
+        }
+    }
+
+    /// Bytes that would suffice, if there are too few.
+    pub(super) fn memory_needed(&self) -> Option<u64> {
+        match self {
+            Self::Memory { needed, .. } | Self::PatchErrorMemory { needed, .. } => Some(*needed),
+            _ => None,
+        }
+    }
+
     /// Whether the work folder is of use to another run: the source and the options are not to blame.
     pub(super) fn keeps_work(&self) -> bool {
-        match self {
+        match self.cause() {
             Self::Work { .. } | Self::Interrupted { .. } => true,
             Self::Store(error) => !matches!(error, StoreError::Spool { .. }),
             _ => false,

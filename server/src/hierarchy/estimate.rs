@@ -14,9 +14,10 @@
 
 use super::coding::{coding, fine_step};
 use super::journal::Journal;
+use super::layers::{LayerSource, Part, parts};
 use super::plan::Plan;
 use super::tallies::Tallies;
-use super::transcribe::{find_quantum, to_quanta};
+use super::transcribe::to_quanta;
 use super::work::{Work, failure};
 use super::{Build, BuildError, Options, Stats, forest_of, tins};
 use crate::canvas::Canvas;
@@ -81,6 +82,54 @@ pub struct Estimate {
     pub disk_bytes: u64,
 }
 
+/// What a build of a scene is expected to take and to give.
+#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+pub struct Estimates {
+    /// Of all layers together.
+    #[serde(flatten)]
+    pub all: Estimate,
+    /// Of each by itself, in the scene's order.
+    pub layers: Vec<LayerEstimate>,
+}
+
+/// What a layer is expected to take and to give.
+#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+pub struct LayerEstimate {
+    /// The layer's name.
+    pub name: String,
+    /// What it takes and gives.
+    #[serde(flatten)]
+    pub estimate: Estimate,
+}
+
+impl Estimate {
+    /// Of layers that are built one after the other.
+    fn sum(layers: &[LayerEstimate]) -> Self {
+        let each = || layers.iter().map(|layer| &layer.estimate);
+        let sum = |of: fn(&Self) -> u64| each().map(of).sum::<u64>();
+        let (valid_samples, point_bytes) = (sum(|e| e.valid_samples), sum(|e| e.point_bytes));
+        Self {
+            samples: sum(|e| e.samples),
+            valid_samples,
+            sampled: sum(|e| e.sampled),
+            diamonds: sum(|e| e.diamonds),
+            point_bytes,
+            bits_per_sample: per(point_bytes as f64 * 8.0, valid_samples),
+            triangles: sum(|e| e.triangles),
+            tin_bytes: sum(|e| e.tin_bytes),
+            seconds: each().map(|e| e.seconds).sum(),
+            memory_bytes: each().map(|e| e.memory_bytes).max().unwrap_or(0),
+            // All work files stay until all layers are published.
+            disk_bytes: sum(|e| e.disk_bytes),
+        }
+    }
+}
+
+/// So much for each of so many; of none, nothing.
+fn per(part: f64, of: u64) -> f64 {
+    if of == 0 { 0.0 } else { part / of as f64 }
+}
+
 /// A tile that was read.
 struct Tile {
     size: [u32; 2],
@@ -90,17 +139,29 @@ struct Tile {
     quarters: [bool; 4],
 }
 
-/// Estimates what [`super::build`] would take and give. Reads at most 17 million samples and takes at most
-/// 100 MB of memory and of temporary files.
+/// Estimates what [`super::build_layers`] would take and give. Reads at most 17 million samples of each layer, and takes at
+/// most 100 MB of memory and of temporary files.
 ///
 /// # Errors
-/// When the source cannot be read or the options do not fit it, as in a build.
-pub fn estimate(source: &Source, options: &Options) -> Result<Estimate, BuildError> {
+/// When a source cannot be read or the options do not fit it, as in a build.
+pub fn estimate(layers: &[LayerSource<'_>], options: &Options) -> Result<Estimates, BuildError> {
+    let of_part = |part: &Part<'_>| -> Result<LayerEstimate, BuildError> {
+        let mut estimate = of_layer(part).map_err(|error| part.failed(error))?;
+        // What is known of the other layers waits meanwhile.
+        estimate.memory_bytes += options.memory - part.options.memory;
+        Ok(LayerEstimate { name: part.layer.name.to_owned(), estimate })
+    };
+    let layers: Vec<LayerEstimate> =
+        parts(layers, options)?.iter().map(of_part).collect::<Result<_, BuildError>>()?;
+    Ok(Estimates { all: Estimate::sum(&layers), layers })
+}
+
+/// Estimates what a layer would take and give.
+fn of_layer(part: &Part<'_>) -> Result<Estimate, BuildError> {
+    let Part { layer, plan, quantum, options, .. } = part;
+    let (source, quantum) = (layer.source, *quantum);
     let grid = source.grid();
     let forest = forest_of(grid, options)?;
-    tins::check(options)?;
-    let plan = Plan::new(forest, options.memory, tins::bytes(&forest, options)?)?;
-    let quantum = find_quantum(source, options)?;
     let started = Instant::now();
     let side = 1u32 << (options.patch_log2 + TILE_LOG2);
     let tile_samples = (side * side) as usize;
@@ -137,7 +198,6 @@ pub fn estimate(source: &Source, options: &Options) -> Result<Estimate, BuildErr
     let workers = rayon::current_num_threads().min(plan.workers);
     let building = all.took / workers as u32;
     let triangulating = all.triangulating / tins::workers(options.memory) as u32;
-    let per = |part: f64, of: u64| if of == 0 { 0.0 } else { part / of as f64 };
     let diamonds = diamonds + (per(all.past_diamonds, built_valid) * valid_samples as f64).round() as u64;
     let diamonds = if options.points { diamonds } else { 0 };
     let in_all = |part: f64| (per(part, built_valid) * valid_samples as f64).round() as u64;
@@ -285,15 +345,15 @@ fn build_tile(tile: &Tile, grid: &Grid, options: &Options) -> Result<Built, Buil
     let forest = plan.forest;
     let progress = Progress::hidden();
     let journal = Journal::create(writer.work_folder(), &[0; 32], Duration::MAX).map_err(&failed)?;
-    let work = Work { writer: &writer, journal, progress: &progress, chunks: 1 };
+    let work = Work { writer: &writer, journal, progress: &progress, chunks: 1, done: AtomicU64::new(0) };
     let build = Build {
+        number: 0,
         plan,
         canvas,
         coding,
         work: &work,
         tallies: Mutex::new(Tallies::new(forest)),
         before: HashSet::new(),
-        done: AtomicU64::new(0),
         grid: &grid,
     };
     let started = Instant::now();

@@ -5,7 +5,7 @@
 use super::tallies::{PerDiamond, Tallies, Tally};
 use super::tins::BEHIND;
 use super::transcribe::Stats;
-use super::{Build, BuildError, Options};
+use super::{Build, BuildError, LayerSource, Options};
 use crate::store::{Key, Kind as BlobKind};
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::index::{self, Entry};
@@ -28,6 +28,7 @@ impl Build<'_> {
     pub(super) fn index(
         &self,
         tallies: Tallies,
+        of: &LayerSource<'_>,
         options: &Options,
         stats: &Stats,
     ) -> Result<(Layer, Sums), BuildError> {
@@ -54,8 +55,8 @@ impl Build<'_> {
         };
         let offset = self.grid.height_offset;
         let layer = Layer {
-            name: options.layer.clone(),
-            kind: options.kind,
+            name: of.name.to_owned(),
+            kind: of.kind,
             forest: *forest,
             origin: self.grid.origin,
             cell,
@@ -97,7 +98,7 @@ impl Build<'_> {
             let diamonds = index::page_diamonds(forest, page).unwrap_or_default();
             let list: Vec<Entry> = diamonds.iter().map(|d| entries.get(*d)).collect();
             let blob = zstd::bulk::compress(&index::encode(&list), 12).map_err(self.work.failure())?;
-            let key = Key { layer: 0, kind, a: page, b: 0 };
+            let key = Key { layer: self.number, kind, a: page, b: 0 };
             self.work.writer.put(key, behind | u64::from(page), &blob)?;
             progress.advance(1);
             Ok(blob.len() as u64)

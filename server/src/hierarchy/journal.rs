@@ -1,7 +1,7 @@
 //! What of a build is done, on disk, so that a killed one goes on where it ended.
 //!
 //! The journal lies in the work folder and only grows. It opens with a fingerprint of the source and of
-//! the options that matter; each record behind it is a finished band of the canvas, a finished chunk, or a finished
+//! the options that matter; each record behind it is a finished band of a layer's canvas, a finished chunk, or a finished
 //! tile of a level of triangles.
 //! A record is written only once what it speaks of is on the disk, so whatever can be read back is true.
 //! A torn or damaged record ends the journal: it and what follows is done again.
@@ -11,7 +11,7 @@
 //!
 //! | offset | size | field | valid range |
 //! |---|---|---|---|
-//! | 0 | 8 | magic | `DMTJRN02` |
+//! | 0 | 8 | magic | `DMTJRN03` |
 //! | 8 | 32 | fingerprint, BLAKE3 | |
 //! | 40 | .. | records | |
 //!
@@ -19,7 +19,11 @@
 //! |---|---|---|---|
 //! | 0 | 4 | bytes of content | at most 2^28 |
 //! | 4 | 8 | XXH3 of the content | |
-//! | 12 | .. | content: 1 and a [`Band`], 2 and a [`Chunk`], or 3 and a [`Tile`], fields in order, little-endian | |
+//! | 12 | 1 | kind | 1 [`Band`], 2 [`Chunk`], 3 [`Tile`] |
+//! | 13 | 1 | position of the layer in the scene | |
+//! | 14 | .. | its fields in order, little-endian | |
+//!
+//! The content begins with the kind.
 
 use super::tins::Place;
 use crate::measure::Found;
@@ -33,7 +37,7 @@ use xxhash_rust::xxh3::xxh3_64;
 
 /// The name of the journal in the work folder.
 const NAME: &str = "journal";
-const MAGIC: &[u8; 8] = b"DMTJRN02";
+const MAGIC: &[u8; 8] = b"DMTJRN03";
 /// The largest content of a record: a chunk of 2^16 cells a side has 400,000 diamonds of 60 bytes.
 const CONTENT_BYTES_MAX: u32 = 1 << 28;
 
@@ -143,13 +147,13 @@ impl Journal {
     }
 
     /// Reads the journal that an earlier run left, record by record. `None` if there is none, or not for
-    /// this fingerprint; `take` is then never called. When `take` says no, that record and all behind it
-    /// count as damaged.
+    /// this fingerprint; `take` is then never called. It gets the position of a layer and what is done of it; when it
+    /// says no, that record and all behind it count as damaged.
     pub(super) fn reopen<E>(
         folder: &Path,
         fingerprint: &Fingerprint,
         interval: Duration,
-        mut take: impl FnMut(Record) -> Result<bool, E>,
+        mut take: impl FnMut(u8, Record) -> Result<bool, E>,
         failed: impl Fn(io::Error) -> E,
     ) -> Result<Option<Self>, E> {
         let path = folder.join(NAME);
@@ -164,8 +168,8 @@ impl Journal {
             return Ok(None);
         }
         let mut intact = 40;
-        while let Some((record, bytes)) = next_record(&mut reader).map_err(&failed)? {
-            if !take(record)? {
+        while let Some((layer, record, bytes)) = next_record(&mut reader).map_err(&failed)? {
+            if !take(layer, record)? {
                 break;
             }
             intact += bytes;
@@ -185,9 +189,9 @@ impl Journal {
         Self { interval, pending: Mutex::new(pending), file: Mutex::new(file) }
     }
 
-    /// Notes that something is done; true if a checkpoint is due.
-    pub(super) fn note(&self, record: &Record) -> bool {
-        let content = content(record);
+    /// Notes that something of a layer is done; true if a checkpoint is due.
+    pub(super) fn note(&self, layer: u8, record: &Record) -> bool {
+        let content = content(layer, record);
         let mut pending = self.pending();
         // Larger than any chunk can have: it would be read back as damage.
         debug_assert!(content.len() <= CONTENT_BYTES_MAX as usize);
@@ -227,8 +231,8 @@ impl Journal {
     }
 }
 
-/// The next intact record and its length; `None` at the end and at the first damage.
-fn next_record(reader: &mut impl Read) -> io::Result<Option<(Record, u64)>> {
+/// The next intact record with its layer, and its length; `None` at the end and at the first damage.
+fn next_record(reader: &mut impl Read) -> io::Result<Option<(u8, Record, u64)>> {
     let mut head = [0; 12];
     if !read_whole(reader, &mut head)? {
         return Ok(None);
@@ -244,7 +248,7 @@ fn next_record(reader: &mut impl Read) -> io::Result<Option<(Record, u64)>> {
     if content.len() as u64 != u64::from(length) || xxh3_64(&content) != checksum {
         return Ok(None);
     }
-    Ok(parse(&content).map(|record| (record, 12 + u64::from(length))))
+    Ok(parse(&content).map(|(layer, record)| (layer, record, 12 + u64::from(length))))
 }
 
 /// Fills `bytes`; false if the file ends before.
@@ -255,11 +259,11 @@ fn read_whole(reader: &mut impl Read, bytes: &mut [u8]) -> io::Result<bool> {
     }
 }
 
-fn content(record: &Record) -> Vec<u8> {
+fn content(layer: u8, record: &Record) -> Vec<u8> {
     let mut out = Vec::new();
     match record {
         Record::Band(band) => {
-            out.push(1);
+            out.extend([1, layer]);
             out.extend(band.y0.to_le_bytes());
             out.extend(band.rows.to_le_bytes());
             out.extend(band.low.to_le_bytes());
@@ -269,7 +273,7 @@ fn content(record: &Record) -> Vec<u8> {
         }
         Record::Chunk(chunk) => {
             out.reserve(21 + chunk.coded.len() * 36 + chunk.found.len() * 17);
-            out.push(2);
+            out.extend([2, layer]);
             out.extend(chunk.number.to_le_bytes());
             out.extend(chunk.finest.to_le_bytes());
             out.extend(u32::try_from(chunk.coded.len()).unwrap_or(u32::MAX).to_le_bytes());
@@ -291,7 +295,7 @@ fn content(record: &Record) -> Vec<u8> {
         }
         Record::Tile(tile) => {
             out.reserve(29 + tile.done.len() * 72);
-            out.push(3);
+            out.extend([3, layer]);
             out.extend(tile.level.to_le_bytes());
             out.extend(tile.number.to_le_bytes());
             out.extend(tile.finest.map(f64::to_le_bytes).as_flattened());
@@ -341,8 +345,8 @@ impl Fields<'_> {
     }
 }
 
-fn parse(content: &[u8]) -> Option<Record> {
-    let (kind, rest) = content.split_first()?;
+fn parse(content: &[u8]) -> Option<(u8, Record)> {
+    let ([kind, layer], rest) = content.split_first_chunk()?;
     let mut f = Fields(rest);
     let record = match kind {
         1 => Record::Band(Band {
@@ -382,7 +386,7 @@ fn parse(content: &[u8]) -> Option<Record> {
         }
         _ => return None,
     };
-    f.0.is_empty().then_some(record)
+    f.0.is_empty().then_some((*layer, record))
 }
 
 #[cfg(test)]
@@ -431,8 +435,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let journal = Journal::create(folder.path(), &FINGERPRINT, Duration::ZERO).unwrap();
         let mut ends = vec![40];
-        for record in records() {
-            assert!(journal.note(&record), "with no interval each record is due at once");
+        for (layer, record) in (0..).zip(records()) {
+            assert!(journal.note(layer, &record), "with no interval each record is due at once");
             journal.checkpoint(|| Ok(()), |e| e).unwrap();
             ends.push(std::fs::metadata(folder.path().join(NAME)).unwrap().len());
         }
@@ -441,7 +445,8 @@ mod tests {
 
     fn read(folder: &Path) -> Option<Vec<Record>> {
         let mut found = Vec::new();
-        let take = |record| {
+        let take = |layer, record| {
+            assert_eq!(usize::from(layer), found.len() % 4, "the layer goes with the record");
             found.push(record);
             Ok(true)
         };
@@ -453,9 +458,9 @@ mod tests {
         let (folder, _) = written();
         assert_eq!(read(folder.path()), Some(records()));
         // And goes on from there.
-        let journal = Journal::reopen(folder.path(), &FINGERPRINT, Duration::ZERO, |_| Ok(true), |e| e);
+        let journal = Journal::reopen(folder.path(), &FINGERPRINT, Duration::ZERO, |_, _| Ok(true), |e| e);
         let journal = journal.unwrap().unwrap();
-        journal.note(&records()[0]);
+        journal.note(0, &records()[0]);
         journal.checkpoint(|| Ok(()), |e: io::Error| e).unwrap();
         assert_eq!(read(folder.path()).unwrap().len(), 5);
     }
@@ -464,7 +469,7 @@ mod tests {
     fn nothing_is_written_that_is_not_synced() {
         let folder = tempfile::tempdir().unwrap();
         let journal = Journal::create(folder.path(), &FINGERPRINT, Duration::ZERO).unwrap();
-        journal.note(&records()[0]);
+        journal.note(0, &records()[0]);
         let failed = journal.checkpoint(|| Err(io::Error::other("no room")), |e| e);
         assert!(failed.is_err());
         assert_eq!(read(folder.path()), Some(vec![]));
@@ -505,7 +510,8 @@ mod tests {
     #[test]
     fn another_fingerprint_is_another_build() {
         let (folder, _) = written();
-        let other = Journal::reopen(folder.path(), &[8; 32], Duration::ZERO, |_| panic!("not ours"), |e| e);
+        let other =
+            Journal::reopen(folder.path(), &[8; 32], Duration::ZERO, |_, _| panic!("not ours"), |e| e);
         let other = other.unwrap();
         assert!(other.is_none());
         assert_eq!(read(folder.path()), Some(records()), "and is left as it is");

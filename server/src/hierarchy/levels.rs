@@ -15,7 +15,7 @@ use diamantina_protocol::points;
 use rayon::prelude::*;
 use std::collections::{BTreeSet, HashMap};
 use std::sync::PoisonError;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 
 /// What the coarse levels leave: the heights that each level draws.
 #[derive(Debug)]
@@ -99,9 +99,9 @@ impl Build<'_> {
     pub(super) fn chunks(&self, coarse: &Coarse) -> Result<(), BuildError> {
         let chunks = self.plan.chunks.corners();
         let cells = 1u64 << (2 * self.plan.chunks.side_log2());
-        let (all, before) = (chunks.len() as u64, self.done.load(Ordering::Relaxed));
+        let (all, before) = (chunks.len() as u64, self.before.len() as u64);
         self.work.progress.stage("build", "samples", all * cells, before * cells);
-        let next = AtomicUsize::new(0);
+        let (next, done) = (AtomicUsize::new(0), AtomicU64::new(before));
         let failed = AtomicBool::new(false);
         let go_on = || !self.work.progress.is_stopping() && !failed.load(Ordering::Relaxed);
         // As many workers as the memory allows, each taking the next chunk when it is done with one.
@@ -114,6 +114,7 @@ impl Build<'_> {
                 }
                 let chunk = self.chunk(number as u32, *corner, coarse);
                 self.finish(chunk).inspect_err(|_| failed.store(true, Ordering::Relaxed))?;
+                done.fetch_add(1, Ordering::Relaxed);
                 self.work.progress.advance(cells);
             }
             Ok(())
@@ -125,7 +126,7 @@ impl Build<'_> {
             let _ = self.work.checkpoint(&self.canvas);
             return Err(error);
         }
-        if self.done.load(Ordering::Relaxed) < all {
+        if done.into_inner() < all {
             self.work.checkpoint(&self.canvas)?;
             return Err(self.interrupted());
         }
@@ -138,8 +139,7 @@ impl Build<'_> {
         let mut tallies = self.tallies.lock().unwrap_or_else(PoisonError::into_inner);
         tallies.add(&self.plan.forest, &chunk);
         drop(tallies);
-        self.done.fetch_add(1, Ordering::Relaxed);
-        if self.work.journal.note(&Record::Chunk(chunk)) {
+        if self.work.note(self.number, &Record::Chunk(chunk)) {
             self.work.checkpoint(&self.canvas)?;
         }
         Ok(())

@@ -1,6 +1,6 @@
 //! Drives a build in bounded memory: source → canvas → diamonds → store.
 //!
-//! 1. **Transcribe.** The source is read once, in bands of rows, into the [`Canvas`]: whole numbers of
+//! 1. **Transcribe.** Each layer's source is read once, in bands of rows, into the [`Canvas`]: whole numbers of
 //!    quanta at every power-of-two spacing.
 //! 2. **Coarse levels.** The levels above the chunks are coded from the canvas' coarsest plane, all in
 //!    memory.
@@ -8,7 +8,10 @@
 //!    only what the coarse levels left: each worker takes one, codes the diamonds that it owns, and
 //!    compares its samples with the surface of every level. Diamonds that straddle a chunk's border are
 //!    computed on both sides (from the same numbers, so with the same result) and written by their owner.
-//! 4. **Index.** Errors and ranges are saturated from the finest level up, pages written, all published.
+//! 4. **Index.** Errors and ranges are saturated from the finest level up, and pages written.
+//!
+//! All sources are read first, so that what is wrong with one is found before hours of work on another; then layer after
+//! layer takes steps 2 to 4, and all are published as one version.
 //!
 //! What is done is noted in a `journal`; a build that was killed goes on from there.
 //!
@@ -19,6 +22,7 @@ mod error;
 mod estimate;
 mod index;
 mod journal;
+mod layers;
 mod levels;
 mod plan;
 mod surface;
@@ -34,21 +38,22 @@ use crate::store::{Kind as BlobKind, Writer};
 use coding::fine_step;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::index::Entry;
-use diamantina_protocol::message::{Frame, Kind, Layer, Scene, TinLayer};
+use diamantina_protocol::message::{Frame, Layer, Scene, TinLayer};
 use diamantina_protocol::points::{Coding, Rule};
 use index::Sums;
+use layers::{Part, parts};
 use plan::Plan;
 use std::collections::HashSet;
 use std::path::Path;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tallies::{PerDiamond, Tallies};
-use transcribe::{Stats, find_quantum, transcribe};
-use work::Work;
+use transcribe::{Stats, transcribe};
+use work::{Before, Work};
 
 pub use error::BuildError;
-pub use estimate::{Estimate, estimate};
+pub use estimate::{Estimate, Estimates, estimate};
+pub use layers::LayerSource;
 pub use tins::{LAMBDA, PATCH_TRIANGLES, PATCH_TRIANGLES_RANGE, TinOptions};
 
 /// What a build may be told.
@@ -56,10 +61,6 @@ pub use tins::{LAMBDA, PATCH_TRIANGLES, PATCH_TRIANGLES_RANGE, TinOptions};
 pub struct Options {
     /// The name of the scene.
     pub scene: String,
-    /// The name of the layer.
-    pub layer: String,
-    /// Terrain or water.
-    pub kind: Kind,
     /// The error asked of the finest level, in metres; 0 is lossless (to the quantum).
     pub max_error: f64,
     /// How the receiver deduces heights.
@@ -81,13 +82,11 @@ pub struct Options {
 }
 
 impl Options {
-    /// A lossless terrain of smooth rule and 64 segments, in 2 GiB: what the command line says by itself.
+    /// Lossless layers of smooth rule and 64 segments, in 2 GiB: what the command line says by itself.
     #[must_use]
     pub fn new(scene: &str) -> Self {
         Self {
             scene: scene.to_owned(),
-            layer: "terrain".to_owned(),
-            kind: Kind::Terrain,
             max_error: 0.0,
             rule: Rule::Smooth,
             quantum: None,
@@ -104,12 +103,35 @@ impl Options {
 /// Between two checkpoints, unless told otherwise. Syncing more often would cost more than a kill does.
 pub const CHECKPOINT: Duration = Duration::from_secs(5);
 
-/// What a build did.
+/// What a build did: sums of all layers.
 #[derive(Debug, Clone, serde::Serialize)]
 pub struct Report {
     /// The scene as published.
     pub scene: Scene,
-    /// Samples of the source.
+    /// Samples of the sources.
+    pub samples: u64,
+    /// Diamonds with a payload.
+    pub diamonds: u64,
+    /// Bytes of payloads.
+    pub point_bytes: u64,
+    /// Bytes of index pages, of all encodings.
+    pub index_bytes: u64,
+    /// Bits of payload for each sample of the sources that has a height.
+    pub bits_per_sample: f64,
+    /// Seconds taken.
+    pub seconds: f64,
+    /// Millions of samples a second.
+    pub msamples_per_second: f64,
+    /// What there is of each layer, in the scene's order.
+    pub layers: Vec<LayerReport>,
+}
+
+/// What a build did of a layer.
+#[derive(Debug, Clone, serde::Serialize)]
+pub struct LayerReport {
+    /// The layer's name.
+    pub name: String,
+    /// Samples of its source.
     pub samples: u64,
     /// Diamonds with a payload.
     pub diamonds: u64,
@@ -119,39 +141,44 @@ pub struct Report {
     pub index_bytes: u64,
     /// Bits of payload for each sample of the source that has a height.
     pub bits_per_sample: f64,
-    /// Seconds taken.
-    pub seconds: f64,
-    /// Millions of samples a second.
-    pub msamples_per_second: f64,
 }
 
-/// Builds a scene of one layer from a source and publishes it at `out`.
-///
-/// What an earlier run of the same build left in the work folder is gone on with; the bytes are those of an
-/// unbroken build. `progress` says when to stop.
+/// Builds a scene of one layer, named terrain, from a source: see [`build_layers`].
 ///
 /// # Errors
-/// When the source or the disk fails, the options do not fit the source, or `progress` was told to stop. The
-/// store at `out`, if there was one, is then untouched. Where the source and the options are not to blame, the
-/// work folder stays, for the same build to go on with.
+/// As [`build_layers`].
 pub fn build(
     source: &Source,
     out: &Path,
     options: &Options,
     progress: &Progress,
 ) -> Result<Report, BuildError> {
+    build_layers(&[LayerSource::terrain(source)], out, options, progress)
+}
+
+/// Builds a scene from the sources of its layers, which lie in one frame, and publishes it at `out`.
+///
+/// What an earlier run of the same build left in the work folder is gone on with; the bytes are those of an
+/// unbroken build. `progress` says when to stop.
+///
+/// # Errors
+/// When a source or the disk fails, the options do not fit a source, or `progress` was told to stop. The
+/// store at `out`, if there was one, is then untouched. Where the sources and the options are not to blame, the
+/// work folder stays, for the same build to go on with.
+pub fn build_layers(
+    layers: &[LayerSource<'_>],
+    out: &Path,
+    options: &Options,
+    progress: &Progress,
+) -> Result<Report, BuildError> {
     let started = Instant::now();
-    let grid = source.grid();
-    let forest = forest_of(grid, options)?;
     // Wrong use is refused before an earlier run's work is touched.
-    tins::check(options)?;
-    let plan = Plan::new(forest, options.memory, tins::bytes(&forest, options)?)?;
-    let quantum = find_quantum(source, options)?;
+    let parts = parts(layers, options)?;
     let writer = Writer::create(out)?;
-    let built = run(source, &writer, options, progress, plan, quantum);
+    let built = run(&parts, &writer, options, progress);
     progress.finish();
     match built {
-        Ok((scene, stats, sums)) => Ok(report(grid, scene, &stats, sums, started)),
+        Ok((scene, sums)) => Ok(report(scene, &sums, started)),
         Err(error) => {
             if error.keeps_work() {
                 writer.keep();
@@ -170,85 +197,129 @@ fn forest_of(grid: &Grid, options: &Options) -> Result<Forest, BuildError> {
     })
 }
 
-/// Reads, codes, indexes and publishes.
+/// Reads, codes, indexes and publishes; the scene, and what coding gave of each layer.
 fn run(
-    source: &Source,
+    parts: &[Part<'_>],
     writer: &Writer,
     options: &Options,
     progress: &Progress,
-    plan: Plan,
-    quantum: f64,
-) -> Result<(Scene, Stats, Sums), BuildError> {
-    let grid = source.grid();
-    let fingerprint = work::fingerprint(source, options, &plan);
-    let (work, canvas, before) = work::open(writer, &plan, grid, &fingerprint, options, progress)?;
-    let stats = transcribe(source, &plan, &canvas, quantum, &before.bands, &work)?;
-    let fine_step = fine_step(options.max_error, &stats)?;
-    let done = AtomicU64::new(before.done());
-    let (plan, coding) = if options.points {
-        coding::coding(&plan, &canvas, options.rule, fine_step)?
-    } else {
-        coding::without_points(&plan, options.rule, fine_step)?
-    };
-    let build = Build {
-        plan,
-        canvas,
-        coding,
-        work: &work,
-        tallies: Mutex::new(before.tallies),
-        done,
-        before: before.chunks,
-        grid,
-    };
-    if options.points {
-        let coarse = build.coarse_levels()?;
-        build.chunks(&coarse)?;
+) -> Result<(Scene, Vec<Sums>), BuildError> {
+    let (work, begun) = work::open(writer, parts, options, progress)?;
+    let mut read = Vec::with_capacity(parts.len());
+    for (part, (canvas, before)) in parts.iter().zip(begun) {
+        progress.of(part.label());
+        let found = || -> Result<(Stats, u32), BuildError> {
+            let stats = transcribe(part, &canvas, &before.bands, &work)?;
+            // What is noted of this canvas must not wait for a checkpoint of another.
+            if parts.len() > 1 {
+                work.checkpoint(&canvas)?;
+            }
+            let fine_step = fine_step(options.max_error, &stats)?;
+            Ok((stats, fine_step))
+        };
+        let (stats, fine_step) = found().map_err(|error| part.failed(error))?;
+        read.push((canvas, before, stats, fine_step));
     }
-    let tallies = build.tallies.lock().unwrap_or_else(PoisonError::into_inner).take();
-    let triangles = build.triangles(before.tins, options, &stats)?;
-    let (mut layer, mut sums) = build.index(tallies, options, &stats)?;
-    if let Some((tin, entries)) = triangles {
-        build.index_triangles(&mut layer, &mut sums, tin, &entries)?;
+    let (mut layers, mut sums) = (Vec::with_capacity(parts.len()), Vec::with_capacity(parts.len()));
+    for (part, (canvas, before, stats, fine_step)) in parts.iter().zip(read) {
+        progress.of(part.label());
+        let built = build_layer(part, canvas, before, &stats, fine_step, &work);
+        let (layer, sum) = built.map_err(|error| part.failed(error))?;
+        layers.push(layer);
+        sums.push(sum);
     }
-    progress.stage("publish", "bytes", layer.bytes, 0);
+    progress.of(None);
+    progress.stage("publish", "bytes", layers.iter().map(|layer| layer.bytes).sum(), 0);
     let scene = Scene {
         name: options.scene.clone(),
         version: String::new(),
-        frame: frame(grid),
-        layers: vec![layer],
+        frame: frame(parts[0].layer.source),
+        layers,
         zones: Vec::new(),
     };
     let go_on = |bytes| {
         progress.advance(bytes);
         !progress.is_stopping()
     };
-    let scene = writer.publish(scene, go_on)?.ok_or_else(|| build.interrupted())?;
-    Ok((scene, stats, sums))
+    let scene = writer.publish(scene, go_on)?.ok_or_else(|| work.interrupted())?;
+    Ok((scene, sums))
 }
 
-/// The frame of a source's grid.
-fn frame(grid: &Grid) -> Frame {
-    Frame { crs: grid.frame_crs(), vertical_unit: "metre".to_owned() }
+/// Codes and indexes a layer that has been read.
+fn build_layer(
+    part: &Part<'_>,
+    canvas: Canvas,
+    before: Before,
+    stats: &Stats,
+    fine_step: u32,
+    work: &Work<'_>,
+) -> Result<(Layer, Sums), BuildError> {
+    let options = &part.options;
+    let (plan, coding) = if options.points {
+        coding::coding(&part.plan, &canvas, options.rule, fine_step)?
+    } else {
+        coding::without_points(&part.plan, options.rule, fine_step)?
+    };
+    let build = Build {
+        number: part.number,
+        plan,
+        canvas,
+        coding,
+        work,
+        tallies: Mutex::new(before.tallies),
+        before: before.chunks,
+        grid: part.layer.source.grid(),
+    };
+    if options.points {
+        let coarse = build.coarse_levels()?;
+        build.chunks(&coarse)?;
+    }
+    let tallies = build.tallies.lock().unwrap_or_else(PoisonError::into_inner).take();
+    let triangles = build.triangles(before.tins, options, stats)?;
+    let (mut layer, mut sums) = build.index(tallies, &part.layer, options, stats)?;
+    if let Some((tin, entries)) = triangles {
+        build.index_triangles(&mut layer, &mut sums, tin, &entries)?;
+    }
+    Ok((layer, sums))
 }
 
-fn report(grid: &Grid, scene: Scene, stats: &Stats, sums: Sums, started: Instant) -> Report {
-    let samples = u64::from(grid.width) * u64::from(grid.height);
+/// The frame that a source lies in.
+fn frame(source: &Source) -> Frame {
+    Frame { crs: source.frame_crs(), vertical_unit: "metre".to_owned() }
+}
+
+fn report(scene: Scene, sums: &[Sums], started: Instant) -> Report {
     let seconds = started.elapsed().as_secs_f64();
-    let Sums { diamonds, point_bytes, index_bytes } = sums;
+    let bits = |bytes: u64, valid: u64| bytes as f64 * 8.0 / valid as f64;
+    let of_layer = |(layer, sums): (&Layer, &Sums)| LayerReport {
+        name: layer.name.clone(),
+        samples: layer.samples.map(u64::from).iter().product(),
+        diamonds: sums.diamonds,
+        point_bytes: sums.point_bytes,
+        index_bytes: sums.index_bytes,
+        bits_per_sample: bits(sums.point_bytes, layer.valid_samples),
+    };
+    let layers: Vec<LayerReport> = scene.layers.iter().zip(sums).map(of_layer).collect();
+    let sum = |of: fn(&LayerReport) -> u64| layers.iter().map(of).sum::<u64>();
+    let (samples, point_bytes) = (sum(|l| l.samples), sum(|l| l.point_bytes));
+    let valid = scene.layers.iter().map(|layer| layer.valid_samples).sum();
     Report {
-        scene,
         samples,
-        diamonds,
+        diamonds: sum(|l| l.diamonds),
         point_bytes,
-        index_bytes,
-        bits_per_sample: point_bytes as f64 * 8.0 / stats.valid as f64,
+        index_bytes: sum(|l| l.index_bytes),
+        bits_per_sample: bits(point_bytes, valid),
         seconds,
         msamples_per_second: samples as f64 / seconds / 1e6,
+        layers,
+        scene,
     }
 }
 
-/// A build under way.
+/// A layer's build under way.
 struct Build<'a> {
+    /// Position of the layer in the scene.
+    number: u8,
     plan: Plan,
     canvas: Canvas,
     coding: Coding,
@@ -256,8 +327,6 @@ struct Build<'a> {
     tallies: Mutex<Tallies>,
     /// Chunks that earlier runs have done.
     before: HashSet<u32>,
-    /// How many are done by now.
-    done: AtomicU64,
     grid: &'a Grid,
 }
 
@@ -271,6 +340,7 @@ impl Build<'_> {
     ) -> Result<Option<(TinLayer, PerDiamond<Entry>)>, BuildError> {
         let Some(((forest, found), tin)) = before.zip(options.tin) else { return Ok(None) };
         let tins = tins::Tins {
+            number: self.number,
             forest,
             canvas: &self.canvas,
             work: self.work,
@@ -280,7 +350,6 @@ impl Build<'_> {
             cell: self.grid.cell,
             workers: tins::workers(options.memory),
             memory: options.memory,
-            done: &self.done,
         };
         let found = tins.run(found)?;
         Ok(Some(tins.describe(found)))
@@ -307,6 +376,6 @@ impl Build<'_> {
     }
 
     fn interrupted(&self) -> BuildError {
-        BuildError::Interrupted { done: self.done.load(Ordering::Relaxed), chunks: self.work.chunks }
+        self.work.interrupted()
     }
 }

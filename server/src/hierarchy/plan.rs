@@ -6,7 +6,7 @@
 //! | rows of the source | an eighth of what is granted | reading |
 //! | coarse levels: heights of each, blocks of the last two | 40 a point of the chunks' lattice | coding |
 //! | a chunk, for each worker: windows 9, surface 4, blocks of two levels 8, a third for the allocator | 28 a cell | coding |
-//! | a diamond's tally, place in the spool, entry, place in a pack, line of the directory | 136 | coding, then publishing |
+//! | a diamond's tally, place in the spool, entry, place in a pack, line of the directory; those of other layers, too | 136 | coding, then publishing |
 
 #![allow(clippy::cast_possible_truncation, reason = "levels are fewer than 64")]
 
@@ -117,6 +117,11 @@ impl Plan {
     pub(super) fn coarsest(&self) -> u32 {
         self.spacing_log2(self.chunks.level())
     }
+}
+
+/// What is known of the diamonds of a layer while another one is built, in bytes, triangles aside.
+pub(super) fn held_bytes(forest: &Forest) -> u64 {
+    places_of_all(&widest(*forest)) * DIAMOND_BYTES
 }
 
 /// The forest with as many levels past its finest lattice as a build makes at most.

@@ -7,7 +7,7 @@
 )]
 
 use super::journal::{Band, Record};
-use super::plan::Plan;
+use super::layers::Part;
 use super::{BuildError, Options, Work};
 use crate::canvas::Canvas;
 use crate::ingest::{Grid, Source};
@@ -100,17 +100,16 @@ fn is_outlier(heights: &mut Vec<f64>, quantum: f64) -> bool {
     rest.first().zip(rest.last()).is_some_and(|(low, high)| high - low < 256.0 * quantum)
 }
 
-/// Reads the source into the canvas, but for the rows of `done`, and says what all rows hold.
+/// Reads the source of a layer into its canvas, but for the rows of `done`, and says what all rows hold.
 pub(super) fn transcribe(
-    source: &Source,
-    plan: &Plan,
+    part: &Part<'_>,
     canvas: &Canvas,
-    quantum: f64,
     done: &[Band],
     work: &Work<'_>,
 ) -> Result<Stats, BuildError> {
+    let (source, quantum) = (part.layer.source, part.quantum);
     let grid = source.grid();
-    let rows = (plan.band_bytes / 16 / u64::from(grid.width)).clamp(1, 256) as u32;
+    let rows = (part.plan.band_bytes / 16 / u64::from(grid.width)).clamp(1, 256) as u32;
     let before: u64 = done.iter().map(|b| u64::from(b.rows)).sum();
     let width = u64::from(grid.width);
     work.progress.stage("read", "samples", width * u64::from(grid.height), width * before);
@@ -124,7 +123,7 @@ pub(super) fn transcribe(
             }
             let band = read_band(source, canvas, quantum, y0, count, work)
                 .inspect_err(|_| failed.store(true, Ordering::Relaxed))?;
-            if work.journal.note(&Record::Band(band)) {
+            if work.journal.note(part.number, &Record::Band(band)) {
                 work.checkpoint(canvas)?;
             }
             work.progress.advance(u64::from(count) * width);
@@ -141,7 +140,7 @@ pub(super) fn transcribe(
     };
     if read.contains(&None) {
         work.checkpoint(canvas)?;
-        return Err(BuildError::Interrupted { done: 0, chunks: work.chunks });
+        return Err(work.interrupted());
     }
     let mut stats = Stats { quantum, low: i32::MAX, high: i32::MIN, valid: 0, rounding: 0.0 };
     for band in done.iter().chain(read.iter().flatten()) {

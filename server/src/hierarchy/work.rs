@@ -1,18 +1,20 @@
 //! The work folder of a build: begun anew, or gone on with where an earlier run ended.
 
 use super::journal::{Band, Chunk, Fingerprint, Journal, Record};
+use super::layers::Part;
 use super::levels::blob_order;
-use super::plan::Plan;
 use super::tallies::Tallies;
 use super::{BuildError, Options, journal, tins};
 use crate::canvas::Canvas;
-use crate::ingest::{Grid, Source};
+use crate::ingest::Grid;
 use crate::progress::Progress;
 use crate::store::{self, Key, Kind as BlobKind, Writer};
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::{index, points};
 use std::collections::HashSet;
 use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// What a build under way keeps its work with.
 #[derive(Debug)]
@@ -20,11 +22,13 @@ pub(super) struct Work<'a> {
     pub(super) writer: &'a Writer,
     pub(super) journal: Journal,
     pub(super) progress: &'a Progress,
-    /// How many chunks there are.
+    /// How many chunks and tiles there are, of all layers, ...
     pub(super) chunks: u64,
+    /// ... and how many of them are done.
+    pub(super) done: AtomicU64,
 }
 
-/// What earlier runs of a build have done.
+/// What earlier runs of a build have done of a layer.
 #[derive(Debug)]
 pub(super) struct Before {
     pub(super) bands: Vec<Band>,
@@ -54,6 +58,16 @@ impl Work<'_> {
         self.journal.checkpoint(sync, self.failure())
     }
 
+    /// Notes that a chunk or a tile is done; true if a checkpoint is due.
+    pub(super) fn note(&self, layer: u8, record: &Record) -> bool {
+        self.done.fetch_add(1, Ordering::Relaxed);
+        self.journal.note(layer, record)
+    }
+
+    pub(super) fn interrupted(&self) -> BuildError {
+        BuildError::Interrupted { done: self.done.load(Ordering::Relaxed), chunks: self.chunks }
+    }
+
     /// Says that the work folder is to blame.
     pub(super) fn failure(&self) -> impl Fn(io::Error) -> BuildError {
         failure(self.writer)
@@ -67,11 +81,9 @@ pub(super) fn failure(writer: &Writer) -> impl Fn(io::Error) -> BuildError {
 
 /// A hash of what the result of a build, and the form of its work files, depend on. Memory counts only by
 /// the chunks that it allows; threads do not count.
-pub(super) fn fingerprint(source: &Source, options: &Options, plan: &Plan) -> Fingerprint {
+fn fingerprint(parts: &[Part<'_>], options: &Options) -> Fingerprint {
     let Options {
         scene,
-        layer,
-        kind,
         max_error,
         rule,
         quantum,
@@ -89,32 +101,51 @@ pub(super) fn fingerprint(source: &Source, options: &Options, plan: &Plan) -> Fi
         diamantina_protocol::tin::FORMAT,
         index::FORMAT,
     );
-    let built = (scene, layer, kind, max_error.to_bits(), rule, quantum.map(f64::to_bits), patch_log2);
-    let built = (built, points, tin);
-    let text = format!("{program:?} {} {built:?} {}", source.identity(), plan.chunks.side_log2());
+    let built = (scene, max_error.to_bits(), rule, quantum.map(f64::to_bits), patch_log2, points, tin);
+    let mut text = format!("{program:?} {built:?}");
+    for part in parts {
+        let (layer, side_log2) = (&part.layer, part.plan.chunks.side_log2());
+        text += &format!(" {:?} {:?} {} {side_log2}", layer.name, layer.kind, layer.source.identity());
+    }
     *blake3::hash(text.as_bytes()).as_bytes()
 }
+
+/// The folder of a layer's planes and halves.
+fn folder_of(work: &Path, part: &Part<'_>) -> PathBuf {
+    work.join(format!("layer-{}", part.number))
+}
+
+/// Of each layer its canvas, and what is done of it.
+type Begun = Vec<(Canvas, Before)>;
 
 /// Goes on with what an earlier run left, if it is of the same build, or begins anew; says which.
 pub(super) fn open<'a>(
     writer: &'a Writer,
-    plan: &Plan,
-    grid: &Grid,
-    fingerprint: &Fingerprint,
+    parts: &[Part<'_>],
     options: &Options,
     progress: &'a Progress,
-) -> Result<(Work<'a>, Canvas, Before), BuildError> {
-    let tin_forest = options.tin.map(|tin| tins::forest_of(&plan.forest, &tin)).transpose()?;
-    let tiles = tin_forest.map_or(0, |forest| tins::tiles_of_all(&forest));
-    let chunks = tiles + if options.points { plan.chunks.corners().len() as u64 } else { 0 };
+) -> Result<(Work<'a>, Begun), BuildError> {
+    let mut nothing = Vec::with_capacity(parts.len());
+    let mut chunks = 0;
+    for part in parts {
+        let tin_forest = options.tin.map(|tin| tins::forest_of(&part.plan.forest, &tin)).transpose()?;
+        chunks += tin_forest.map_or(0, |forest| tins::tiles_of_all(&forest));
+        chunks += if options.points { part.plan.chunks.corners().len() as u64 } else { 0 };
+        nothing.push(Before::nothing(part, tin_forest));
+    }
+    let work = |journal, done| Work { writer, journal, progress, chunks, done: AtomicU64::new(done) };
+    let fingerprint = fingerprint(parts, options);
     let folder = writer.work_folder();
     let left = Journal::exists(folder);
     if left && !options.fresh {
-        let resumed = resume(writer, plan, tin_forest, grid, fingerprint, options)?;
-        if let Some((journal, canvas, before)) = resumed {
-            progress.say(&before.words(grid, chunks));
-            return Ok((Work { writer, journal, progress, chunks }, canvas, before));
+        let mut before = nothing;
+        if let Some((journal, canvases)) = resume(writer, parts, &mut before, &fingerprint, options)? {
+            progress.say(&words(parts, &before, chunks));
+            let done = before.iter().map(Before::done).sum();
+            return Ok((work(journal, done), canvases.into_iter().zip(before).collect()));
         }
+        // Nothing was taken from a journal of another build.
+        nothing = before;
     }
     if left {
         let why = if options.fresh {
@@ -126,40 +157,65 @@ pub(super) fn open<'a>(
     }
     writer.clear()?;
     let failed = failure(writer);
-    let canvas = Canvas::create(folder, grid.width, grid.height, plan.coarsest()).map_err(&failed)?;
-    let journal = Journal::create(folder, fingerprint, options.checkpoint).map_err(&failed)?;
-    Ok((Work { writer, journal, progress, chunks }, canvas, Before::nothing(plan, tin_forest)))
+    let canvas = |part: &Part<'_>| {
+        let (folder, Grid { width, height, .. }) = (folder_of(folder, part), part.layer.source.grid());
+        std::fs::create_dir_all(&folder)?;
+        Canvas::create(&folder, *width, *height, part.plan.coarsest())
+    };
+    let canvases: Vec<Canvas> = parts.iter().map(canvas).collect::<io::Result<_>>().map_err(&failed)?;
+    let journal = Journal::create(folder, &fingerprint, options.checkpoint).map_err(&failed)?;
+    Ok((work(journal, 0), canvases.into_iter().zip(nothing).collect()))
 }
 
-/// What an earlier run of the same build left; `None` if there is none that can be gone on with.
+/// Adds to `before` what an earlier run of the same build left; `None`, with nothing added, if there is none that can be
+/// gone on with.
 fn resume(
     writer: &Writer,
-    plan: &Plan,
-    tin_forest: Option<Forest>,
-    grid: &Grid,
+    parts: &[Part<'_>],
+    before: &mut [Before],
     fingerprint: &Fingerprint,
     options: &Options,
-) -> Result<Option<(Journal, Canvas, Before)>, BuildError> {
+) -> Result<Option<(Journal, Vec<Canvas>)>, BuildError> {
     let folder = writer.work_folder();
     let failed = failure(writer);
-    let canvas = Canvas::reopen(folder, grid.width, grid.height, plan.coarsest()).map_err(&failed)?;
-    let Some(canvas) = canvas else { return Ok(None) };
-    let mut before = Before::nothing(plan, tin_forest);
-    let take = |record| match record {
-        Record::Band(band) => Ok(before.take_band(band, grid)),
-        Record::Chunk(chunk) => before.take_chunk(&chunk, plan, writer),
-        Record::Tile(tile) => before.take_tile(&tile, writer),
+    let mut canvases = Vec::with_capacity(parts.len());
+    for part in parts {
+        let Grid { width, height, .. } = part.layer.source.grid();
+        let canvas = Canvas::reopen(&folder_of(folder, part), *width, *height, part.plan.coarsest());
+        let Some(canvas) = canvas.map_err(&failed)? else { return Ok(None) };
+        canvases.push(canvas);
+    }
+    let take = |layer: u8, record| {
+        let number = usize::from(layer);
+        let (Some(before), Some(part)) = (before.get_mut(number), parts.get(number)) else {
+            return Ok(false);
+        };
+        match record {
+            Record::Band(band) => Ok(before.take_band(band, part.layer.source.grid())),
+            Record::Chunk(chunk) => before.take_chunk(&chunk, part, writer),
+            Record::Tile(tile) => before.take_tile(&tile, part, writer),
+        }
     };
     let journal = Journal::reopen(folder, fingerprint, options.checkpoint, take, &failed)?;
     let Some(journal) = journal else { return Ok(None) };
     writer.settle()?;
-    Ok(Some((journal, canvas, before)))
+    Ok(Some((journal, canvases)))
+}
+
+/// How far the earlier runs came.
+fn words(parts: &[Part<'_>], before: &[Before], chunks: u64) -> String {
+    let all: u64 = parts.iter().map(|part| u64::from(part.layer.source.grid().height)).sum();
+    let rows: u64 = before.iter().flat_map(|before| &before.bands).map(|band| u64::from(band.rows)).sum();
+    if rows < all {
+        return format!("resuming: {rows} of {all} rows are read");
+    }
+    format!("resuming: {} of {chunks} chunks are done", before.iter().map(Before::done).sum::<u64>())
 }
 
 impl Before {
-    fn nothing(plan: &Plan, tin_forest: Option<Forest>) -> Self {
+    fn nothing(part: &Part<'_>, tin_forest: Option<Forest>) -> Self {
         let tins = tin_forest.map(|forest| (forest, tins::Found::new(forest)));
-        Self { bands: Vec::new(), chunks: HashSet::new(), tallies: Tallies::new(plan.forest), tins }
+        Self { bands: Vec::new(), chunks: HashSet::new(), tallies: Tallies::new(part.plan.forest), tins }
     }
 
     /// Chunks and tiles that are done.
@@ -177,12 +233,13 @@ impl Before {
     }
 
     /// Takes over a chunk and its blobs; false if they are not there, or it is none of this plan.
-    fn take_chunk(&mut self, chunk: &Chunk, plan: &Plan, writer: &Writer) -> Result<bool, BuildError> {
+    fn take_chunk(&mut self, chunk: &Chunk, part: &Part<'_>, writer: &Writer) -> Result<bool, BuildError> {
+        let plan = &part.plan;
         let mut blobs = Vec::with_capacity(chunk.coded.len());
         for journal::Coded { centre, spot, .. } in &chunk.coded {
             let Some(d) = plan.forest.diamond(*centre) else { return Ok(false) };
             let [a, b] = *centre;
-            let key = Key { layer: 0, kind: BlobKind::Points, a, b };
+            let key = Key { layer: part.number, kind: BlobKind::Points, a, b };
             blobs.extend(spot.map(|spot| (key, blob_order(d), spot)));
         }
         if self.chunks.contains(&chunk.number) || !writer.adopt(&blobs)? {
@@ -193,24 +250,20 @@ impl Before {
     }
 
     /// Takes over a tile of triangles and its blobs; false if they are not there, or it is none of this build.
-    fn take_tile(&mut self, tile: &journal::Tile, writer: &Writer) -> Result<bool, BuildError> {
+    fn take_tile(
+        &mut self,
+        tile: &journal::Tile,
+        part: &Part<'_>,
+        writer: &Writer,
+    ) -> Result<bool, BuildError> {
         let Some((forest, found)) = &mut self.tins else { return Ok(false) };
         let mut blobs = Vec::with_capacity(tile.done.len());
         for journal::Triangulated { centre, spot, .. } in &tile.done {
             let Some(d) = forest.diamond(*centre) else { return Ok(false) };
             let [a, b] = *centre;
-            let key = Key { layer: 0, kind: BlobKind::Tin, a, b };
+            let key = Key { layer: part.number, kind: BlobKind::Tin, a, b };
             blobs.extend(spot.map(|spot| (key, tins::BEHIND | blob_order(d), spot)));
         }
         Ok(writer.adopt(&blobs)? && found.add(forest, tile))
-    }
-
-    /// How far the earlier runs came.
-    fn words(&self, grid: &Grid, chunks: u64) -> String {
-        let rows: u64 = self.bands.iter().map(|band| u64::from(band.rows)).sum();
-        if rows < u64::from(grid.height) {
-            return format!("resuming: {rows} of {} rows are read", grid.height);
-        }
-        format!("resuming: {} of {chunks} chunks are done", self.done())
     }
 }

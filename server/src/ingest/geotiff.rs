@@ -2,13 +2,14 @@
 //!
 //! The header is checked first (see `tiff_header`). Uncompressed samples are then read by position, whatever
 //! the size of their strips; compressed chunks are decoded whole by the `tiff` crate, a few decoders at a
-//! time, and kept in a cache bounded by bytes that all files of a layer share.
+//! time, and kept in a cache bounded by bytes that all files of a scene share.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
 use std::io::{self, BufReader, Read, Seek, SeekFrom};
 use std::os::unix::fs::FileExt;
 use std::path::Path;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use tiff::decoder::{Decoder, DecodingResult};
@@ -71,7 +72,7 @@ impl Layout {
     }
 }
 
-/// Opens a TIFF. The cache is shared by the files of a layer, `id` tells them apart.
+/// Opens a TIFF. The cache is shared by the files of a scene, `id` tells them apart.
 pub(super) fn open(path: &Path, file: File, cache: Arc<ChunkCache>, id: u32) -> Result<Raster> {
     let header = Header::read(path, &file)?;
     let layout = layout(path, &header)?;
@@ -498,6 +499,8 @@ type Key = (u32, u32);
 pub(super) struct ChunkCache {
     budget_bytes: usize,
     state: Mutex<CacheState>,
+    /// Names given so far.
+    names: AtomicU32,
 }
 
 #[derive(Default)]
@@ -511,7 +514,12 @@ struct CacheState {
 
 impl ChunkCache {
     pub(super) fn new(budget_bytes: usize) -> Self {
-        Self { budget_bytes, state: Mutex::default() }
+        Self { budget_bytes, state: Mutex::default(), names: AtomicU32::new(0) }
+    }
+
+    /// A name for another file that shares this cache.
+    pub(super) fn name(&self) -> u32 {
+        self.names.fetch_add(1, Ordering::Relaxed)
     }
 
     fn get(&self, key: Key) -> Option<Arc<DecodingResult>> {

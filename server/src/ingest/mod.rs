@@ -1,7 +1,8 @@
 //! DEM files → heights, window by window: one layer from one or several rasters.
 //!
 //! `open` finds each file's format by its content, joins the files to a mosaic on one grid and, where
-//! asked, plans a reprojection; `Source::read` then answers any window from any thread. Nothing is ever
+//! asked, plans a reprojection; `Source::read` then answers any window from any thread. The first layer of a scene
+//! decides the frame, and [`open_over`] lays others into it. Nothing is ever
 //! read whole: TIFFs are read by strip or tile, other formats by position; what can only be read from
 //! start to end is transcribed once to a temporary file (8 bytes a sample, 1 or 2 for PNG).
 //!
@@ -18,6 +19,7 @@ mod geokeys;
 mod geotiff;
 mod hgt;
 mod mosaic;
+mod over;
 mod packed;
 mod png;
 mod raster;
@@ -39,16 +41,18 @@ use std::str::FromStr;
 use std::sync::Arc;
 
 pub use error::IngestError;
+pub use over::{level, open_over};
 
 use crate::projection;
 use error::{Result, broken, io_error, options as bad_options, unsupported};
 use geotiff::ChunkCache;
 use mosaic::Mosaic;
+use over::Base;
 use raster::{Dtype, Place, Raster, SIDE_MAX, Samples, SourceCrs, Window};
 use reproject::Reprojection;
 use samples::{Order, SampleFile};
 
-/// Decoded strips and tiles kept for one layer.
+/// Decoded strips and tiles kept for one scene.
 const CACHE_BYTES: usize = 128 << 20;
 /// Widest geographic source that one UTM zone may carry, degrees; the scale is 6 % off at its rims.
 const UTM_DEGREES_MAX: f64 = 40.0;
@@ -206,14 +210,27 @@ pub struct Crs {
 /// One layer's heights, open for reading.
 ///
 /// Holds one file handle a source file (and temporary files, which vanish with it), 16 bytes for each
-/// TIFF strip or tile, and at most 128 MiB of decoded ones for the whole layer.
+/// TIFF strip or tile, and at most 128 MiB of decoded ones, which layers of a scene share.
 pub struct Source {
     grid: Grid,
     identity: String,
-    mosaic: Mosaic,
-    reprojection: Option<Reprojection>,
-    /// Whether the user says that no value stands for "no data".
-    all_heights: bool,
+    heights: Heights,
+    /// The frame that it lies in.
+    base: Base,
+    cache: Arc<ChunkCache>,
+}
+
+/// Where heights come from.
+enum Heights {
+    /// Files.
+    Files {
+        mosaic: Mosaic,
+        reprojection: Option<Reprojection>,
+        /// Whether the user says that no value stands for "no data".
+        all_heights: bool,
+    },
+    /// The same everywhere: 0, above the grid's offset.
+    Level,
 }
 
 impl fmt::Debug for Source {
@@ -228,22 +245,36 @@ impl fmt::Debug for Source {
 /// # Errors
 /// When a file is missing, damaged, of an unknown kind, does not fit the others or the options.
 pub fn open(paths: &[PathBuf], options: &Options) -> std::result::Result<Source, IngestError> {
+    let cache = Arc::new(ChunkCache::new(CACHE_BYTES));
+    open_with(paths, options, cache, |first, mosaic| {
+        let (grid, reprojection, crs) = frame(first, mosaic, options)?;
+        let base = Base::new(first, &grid, crs);
+        Ok((grid, reprojection, base))
+    })
+}
+
+/// Opens files as one layer whose place in a frame is found by `place`.
+fn open_with(
+    paths: &[PathBuf],
+    options: &Options,
+    cache: Arc<ChunkCache>,
+    place: impl FnOnce(&Path, &Mosaic) -> Result<(Grid, Option<Reprojection>, Base)>,
+) -> Result<Source> {
     let first = paths.first().ok_or(IngestError::NoInput)?;
     check_numbers(first, options)?;
-    let cache = Arc::new(ChunkCache::new(CACHE_BYTES));
     let mut rasters = Vec::with_capacity(paths.len());
-    for (id, path) in (0..).zip(paths) {
-        let mut raster = open_file(path, options, &cache, id)?;
+    for path in paths {
+        let mut raster = open_file(path, options, &cache)?;
         override_values(&mut raster, options)?;
         assume_crs(&mut raster, options)?;
         rasters.push(raster);
     }
     let mosaic = Mosaic::new(rasters)?;
-    let (grid, reprojection) = frame(first, &mosaic, options)?;
+    let (grid, reprojection, base) = place(first, &mosaic)?;
     check_grid(first, &grid)?;
     let identity = identity(paths, options, &grid)?;
     let all_heights = options.nodata.is_some_and(f64::is_nan);
-    Ok(Source { grid, identity, mosaic, reprojection, all_heights })
+    Ok(Source { grid, identity, heights: Heights::Files { mosaic, reprojection, all_heights }, base, cache })
 }
 
 /// What tells this source from others without reading it.
@@ -271,8 +302,9 @@ impl Source {
     /// # Errors
     /// When there was: it would become a pit or a spire.
     pub fn check_nodata(&self) -> std::result::Result<(), IngestError> {
-        match self.mosaic.suspect() {
-            Some((file, value, [low, high])) if !self.all_heights => Err(bad_options(
+        let Heights::Files { mosaic, all_heights, .. } = &self.heights else { return Ok(()) };
+        match mosaic.suspect() {
+            Some((file, value, [low, high])) if !all_heights => Err(bad_options(
                 file,
                 format!("heights about as far apart as the others, which are {low} to {high}"),
                 format!("{value}, which usually means \"no data\" and is not declared here"),
@@ -280,6 +312,13 @@ impl Source {
             )),
             _ => Ok(()),
         }
+    }
+
+    /// The system of coordinates of the frame that this lies in, and how the frame lies in it: the same for all layers of
+    /// a scene.
+    #[must_use]
+    pub fn frame_crs(&self) -> Option<diamantina_protocol::message::Crs> {
+        self.base.lies().cloned()
     }
 
     /// The lattice that windows refer to.
@@ -318,9 +357,15 @@ impl Source {
         if window.samples() == 0 {
             return Ok(());
         }
-        match &self.reprojection {
-            Some(reprojection) => reprojection.read(&self.mosaic, window, out),
-            None => self.mosaic.read(window, out),
+        match &self.heights {
+            Heights::Files { mosaic, reprojection: Some(reprojection), .. } => {
+                reprojection.read(mosaic, window, out)
+            }
+            Heights::Files { mosaic, .. } => mosaic.read(window, out),
+            Heights::Level => {
+                out.fill(0.0);
+                Ok(())
+            }
         }
     }
 }
@@ -359,7 +404,7 @@ fn check_grid(file: &Path, grid: &Grid) -> Result<()> {
 }
 
 /// Opens one file, whatever its format.
-fn open_file(path: &Path, options: &Options, cache: &Arc<ChunkCache>, id: u32) -> Result<Raster> {
+fn open_file(path: &Path, options: &Options, cache: &Arc<ChunkCache>) -> Result<Raster> {
     // Before it is opened: opening a pipe would wait for somebody to write into it.
     let metadata = path.metadata().map_err(io_error(path, "open it"))?;
     if metadata.is_dir() {
@@ -385,11 +430,11 @@ fn open_file(path: &Path, options: &Options, cache: &Arc<ChunkCache>, id: u32) -
     } else {
         (file, name)
     };
-    detect(path, file, &name, cache, id)
+    detect(path, file, &name, cache)
 }
 
 /// Chooses the format by content; `.hgt` alone has no mark of its own and goes by `name` (lower case).
-fn detect(path: &Path, file: File, name: &str, cache: &Arc<ChunkCache>, id: u32) -> Result<Raster> {
+fn detect(path: &Path, file: File, name: &str, cache: &Arc<ChunkCache>) -> Result<Raster> {
     let mut start = vec![0; 1024];
     let length = file.read_at(&mut start, 0).map_err(io_error(path, "read it"))?;
     start.truncate(length);
@@ -399,7 +444,7 @@ fn detect(path: &Path, file: File, name: &str, cache: &Arc<ChunkCache>, id: u32)
         [] => Err(broken(path, "a DEM", "an empty file", "fetch it again")),
         _ if name.ends_with(".hgt") => hgt::open(path, file, name),
         [b'I', b'I', 42 | 43, 0, ..] | [b'M', b'M', 0, 42 | 43, ..] => {
-            geotiff::open(path, file, Arc::clone(cache), id)
+            geotiff::open(path, file, Arc::clone(cache), cache.name())
         }
         [0x89, b'P', b'N', b'G', ..] => png::open(path, file),
         _ if text.starts_with(b"ncols") || text.starts_with(b"nrows") => ascii_grid::open(path, file),
@@ -513,8 +558,11 @@ fn looks_like_degrees(mosaic: &Mosaic, place: &Place) -> bool {
     in_range && ((small && away) || around)
 }
 
+/// A grid, how to reach it if heights are resampled, and the CRS of the frame, if it is known.
+type Framed = (Grid, Option<Reprojection>, Option<SourceCrs>);
+
 /// Decides the frame: the source's own lattice or a resampled one.
-fn frame(file: &Path, mosaic: &Mosaic, options: &Options) -> Result<(Grid, Option<Reprojection>)> {
+fn frame(file: &Path, mosaic: &Mosaic, options: &Options) -> Result<Framed> {
     let Some(place) = &mosaic.place else {
         if let CrsChoice::Epsg(code) = options.crs {
             return Err(no_crs(file, &format!("EPSG:{code}")));
@@ -523,14 +571,14 @@ fn frame(file: &Path, mosaic: &Mosaic, options: &Options) -> Result<(Grid, Optio
             let found = "a file that does not say how far its samples are apart";
             bad_options(file, "--cell METRES", found, "add --cell with the metres between samples")
         })?;
-        return Ok((grid(mosaic, [0.0; 2], [cell; 2], None), None));
+        return Ok((grid(mosaic, [0.0; 2], [cell; 2], None), None, None));
     };
     if place.crs.is_none() && looks_like_degrees(mosaic, place) && !matches!(options.crs, CrsChoice::Epsg(_))
     {
         // As metres they would make a scene of centimetres.
         let [x, y] = place.origin;
         return match options.cell {
-            Some(cell) => Ok((grid(mosaic, [0.0; 2], [cell; 2], None), None)),
+            Some(cell) => Ok((grid(mosaic, [0.0; 2], [cell; 2], None), None, None)),
             None => Err(bad_options(
                 file,
                 "a CRS, or coordinates in metres",
@@ -554,14 +602,17 @@ fn frame(file: &Path, mosaic: &Mosaic, options: &Options) -> Result<(Grid, Optio
         }
     };
     match target {
-        Some(target) => resampled(mosaic, place, &target, options.cell),
+        Some(target) => {
+            let (grid, plan) = resampled(mosaic, place, &target, options.cell)?;
+            Ok((grid, Some(plan), Some(target)))
+        }
         None if options.cell.is_some() => Err(bad_options(
             file,
             "--cell only with a reprojection",
             "a source that keeps its own cells",
             "leave --cell out, or say --crs EPSG:N",
         )),
-        None => Ok((as_it_is(mosaic, place), None)),
+        None => Ok((as_it_is(mosaic, place), None, place.crs.clone())),
     }
 }
 
@@ -662,7 +713,7 @@ fn resampled(
     place: &Place,
     target: &SourceCrs,
     cell: Option<f64>,
-) -> Result<(Grid, Option<Reprojection>)> {
+) -> Result<(Grid, Reprojection)> {
     let plan = Reprojection::new(mosaic, place, target, cell)?;
     let crs = Crs {
         name: target.name.clone(),
@@ -673,7 +724,7 @@ fn resampled(
     let origin = plan.origin.map(|v| v * target.metres_per_unit);
     let own = grid(mosaic, origin, [plan.step * target.metres_per_unit; 2], Some(crs));
     let grid = Grid { width: plan.width, height: plan.height, resampled: true, ..own };
-    Ok((grid, Some(plan)))
+    Ok((grid, plan))
 }
 
 fn grid(mosaic: &Mosaic, origin: [f64; 2], cell: [f64; 2], crs: Option<Crs>) -> Grid {

@@ -14,6 +14,8 @@
 //! | [`view`] | where the eyes of a zone stand, and why that is enough |
 //! | [`cast`] | what of a relief is seen from eyes, and how well the rest is hidden |
 //!
+//! Of each layer of terrain it is found by its own heights. Water hides nothing, and counts as seen.
+//!
 //! After Cifuentes, D'Amato, García Bauza, Vénere, Lotito and Clausse, *Ray casting para la definición de zonas de
 //! interés en simplificación topográfica* (2007). Theirs is a binary mask; here, what is hidden by little counts for
 //! more than what is hidden well: an error is let grow only as far as it stays behind what hides it.
@@ -262,9 +264,18 @@ pub fn add(root: &Path, options: &Options, progress: &Progress) -> Result<Report
     let mut masks = Vec::with_capacity(grounds.len());
     progress.stage("zone", "eyes", (eyes.len() * grounds.len()) as u64, 0);
     for (layer, ground) in scene.layers.iter().zip(&grounds) {
-        let shares = shares(ground, &polygons, &eyes, options, progress).ok_or(ZoneError::Interrupted)?;
-        tally.azimuths +=
-            eyes.iter().map(|(p, z)| azimuths(ground, ground.eye(*p, *z), options)).sum::<u64>();
+        let shares = match layer.kind {
+            Kind::Terrain => {
+                tally.azimuths +=
+                    eyes.iter().map(|(p, z)| azimuths(ground, ground.eye(*p, *z), options)).sum::<u64>();
+                shares(ground, &polygons, &eyes, options, progress).ok_or(ZoneError::Interrupted)?
+            }
+            // Water is seen through, so it hides nothing, itself included; and what ground hides of it is not looked at.
+            Kind::Water => {
+                progress.advance(eyes.len() as u64);
+                Tiled::filled(ground.relief.size(), u8::MAX)
+            }
+        };
         tally.count(&shares, pack(options.hidden));
         masks.push(mask(layer, &shares, pack(options.hidden), scene.layers.len()));
     }

@@ -37,7 +37,7 @@ use halves::Halves;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, HashSet};
 use std::io;
-use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
 /// How the triangles of a layer are chosen.
@@ -200,6 +200,8 @@ impl Known {
 
 /// A build's triangles under way.
 pub(super) struct Tins<'a> {
+    /// Position of the layer in the scene.
+    pub(super) number: u8,
     pub(super) forest: Forest,
     pub(super) canvas: &'a Canvas,
     pub(super) work: &'a Work<'a>,
@@ -210,8 +212,6 @@ pub(super) struct Tins<'a> {
     pub(super) workers: usize,
     /// The most memory, in bytes.
     pub(super) memory: u64,
-    /// Chunks and tiles that are done.
-    pub(super) done: &'a AtomicU64,
 }
 
 /// What is done. Takes 32 bytes a diamond, and 16 more of two levels.
@@ -278,7 +278,7 @@ impl Tins<'_> {
         let found = RwLock::new(before);
         let all: u64 = (0..forest.levels()).map(|level| forest.diamonds(level).count() as u64).sum();
         self.work.progress.stage("triangulate", "diamonds", all, 0);
-        let folder = self.work.writer.work_folder();
+        let folder = self.canvas.folder();
         let failed = self.work.failure();
         for level in (0..forest.levels()).rev() {
             let tiles = tiles(forest, level);
@@ -332,8 +332,7 @@ impl Tins<'_> {
                         .tile(level, number, diamonds, input, output)
                         .inspect_err(|_| failed.store(true, Ordering::Relaxed))?;
                     write(found).add(&self.forest, &tile);
-                    self.done.fetch_add(1, Ordering::Relaxed);
-                    if self.work.journal.note(&Record::Tile(tile)) {
+                    if self.work.note(self.number, &Record::Tile(tile)) {
                         self.work.checkpoint_with(self.canvas, || output.sync())?;
                     }
                 }
@@ -349,8 +348,7 @@ impl Tins<'_> {
         let count = u32::try_from(tiles.len()).unwrap_or(u32::MAX);
         if !(0..count).all(|number| read(found).tiles.contains(&(level, number))) {
             self.work.checkpoint_with(self.canvas, || output.sync())?;
-            let (done, chunks) = (self.done.load(Ordering::Relaxed), self.work.chunks);
-            return Err(BuildError::Interrupted { done, chunks });
+            return Err(self.work.interrupted());
         }
         Ok(())
     }

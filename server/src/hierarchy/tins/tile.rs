@@ -81,8 +81,7 @@ impl Tins<'_> {
         let mut finest = Finest::new();
         for d in diamonds {
             if self.work.progress.is_out_of_patience() {
-                let done = self.done.load(std::sync::atomic::Ordering::Relaxed);
-                return Err(BuildError::Interrupted { done, chunks: self.work.chunks });
+                return Err(self.work.interrupted());
             }
             let merged = match (input, &window) {
                 (Some((halves, place)), _) => {
@@ -130,7 +129,7 @@ impl Tins<'_> {
             return Err(BuildError::Payload { centre, bytes: payload.len() });
         }
         let [a, b] = centre;
-        let key = Key { layer: 0, kind: BlobKind::Tin, a, b };
+        let key = Key { layer: self.number, kind: BlobKind::Tin, a, b };
         one.spot = Some(self.work.writer.put(key, BEHIND | blob_order(d), &payload)?);
         if d.level() == 0 {
             return Ok(one);

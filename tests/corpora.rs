@@ -1,9 +1,10 @@
 //! The fuzzer's seeds, and inputs like them, given to every decoder: what it once found stays mended.
 
-#[path = "../fuzz/src/lib.rs"]
+#[allow(unreachable_pub, reason = "a library of its own where it is fuzzed")]
+#[path = "../protocol/fuzz/src/lib.rs"]
 mod targets;
 
-use std::path::Path;
+use crate::world::workspace;
 
 type Target = (&'static str, fn(&[u8]));
 
@@ -56,7 +57,7 @@ fn varied(seed: &[u8], dice: &mut Dice) -> Vec<u8> {
 
 #[test]
 fn every_decoder_stands_its_seeds_and_what_is_like_them() {
-    let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/corpus");
+    let corpus = workspace().join("protocol/fuzz/corpus");
     for (name, run) in TARGETS {
         let mut seeds: Vec<_> = std::fs::read_dir(corpus.join(name))
             .unwrap_or_else(|e| panic!("{name}: {e}"))
@@ -78,7 +79,7 @@ fn every_decoder_stands_its_seeds_and_what_is_like_them() {
 
 #[test]
 fn every_target_is_tried_here() {
-    let targets = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/fuzz_targets");
+    let targets = workspace().join("protocol/fuzz/fuzz_targets");
     for entry in std::fs::read_dir(targets).unwrap() {
         let name = entry.unwrap().file_name().into_string().unwrap();
         assert!(TARGETS.iter().any(|(known, _)| name == format!("{known}.rs")), "{name}");
