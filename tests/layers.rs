@@ -271,7 +271,7 @@ fn each_layer_is_served_inspected_and_mended_by_its_name() {
     let text = server(pair.folder(), "inspect {}/store").out;
     assert!(text.contains("layer terrain: terrain, ") && text.contains("layer sea: water, "), "{text}");
     let curve = server(pair.folder(), "inspect {}/store --curve -").out;
-    assert!(["\nterrain,", "\nsea,"].iter().all(|layer| curve.matches(layer).count() > 3), "{curve}");
+    assert!(["\nterrain,", "\nsea,"].iter().all(|layer| curve.matches(layer).count() > 2), "{curve}");
     // A dry run knows both, and is not far off.
     let dry = server(pair.folder(), &Pair::command("none", "--dry-run --json"));
     let estimate: serde_json::Value = serde_json::from_str(&dry.out).unwrap();
@@ -301,7 +301,7 @@ fn each_layer_is_served_inspected_and_mended_by_its_name() {
     bytes[at + payload.len() / 2] ^= 1;
     std::fs::write(&pack, bytes).unwrap();
     let told = server(pair.folder(), "repair {}/store");
-    assert!(told.code == Some(1) && told.out.contains("sea"), "{told:?}");
+    assert!(told.code == Some(1) && told.out.contains("layer: 1"), "{told:?}");
     let mended = server(pair.folder(), "repair {}/store --from {}/copy");
     assert!(mended.code == Some(0) && mended.out.contains("1 mended"), "{mended:?}");
     assert_eq!(server(pair.folder(), "inspect {}/store --verify").code, Some(0));
@@ -320,23 +320,19 @@ fn a_picture_shows_the_layers_that_are_asked_for_and_no_others() {
         let ended = client(pair.folder(), &command);
         (ended, pair.folder().join(format!("{name}.png")))
     };
-    let drawn = |scene: &str, name: &str, options: &str| {
-        let (ended, path) = render(scene, name, options);
+    // All from one place: an overview depends on what has arrived when it is chosen.
+    let [x, y] = sample::place(0.5, 0.1, 400);
+    let view = format!("--eye {x},{},6000 --target {x},{},0 --background ff00ff", y - 4000.0, y + 1000.0);
+    let drawn = |scene: &str, options: &str| {
+        let (ended, path) = render(scene, "picture", &format!("{view} {options}"));
         assert_eq!(ended.code, Some(0), "{ended:?}");
         pixels(&path)
     };
-    let all = drawn("world", "all", "");
-    let ground = drawn("world", "ground", "--layer terrain");
-    let sea = drawn("world", "sea", "--layer sea");
-    let named = drawn("world", "named", "--layer sea,terrain");
-    assert!(all == named, "all layers by name are all layers");
-    assert!(ground == drawn("alone", "alone", ""), "without the sea it is the scene without a sea");
+    let all = drawn("world", "");
+    let [ground, sea] = ["terrain", "sea"].map(|layer| drawn("world", &format!("--layer {layer}")));
+    assert!(all == drawn("world", "--layer sea,terrain"), "all layers by name are all layers");
+    assert!(ground == drawn("alone", ""), "without the sea it is the scene without a sea");
     assert!(all != ground && all != sea && ground != sea);
-    // From one place: what the sea adds is the sea's own.
-    let [x, y] = sample::place(0.5, 0.1, 400);
-    let eye = format!("--eye {x},{},6000 --target {x},{},0", y - 4000.0, y + 1000.0);
-    let [all, ground, sea] = ["terrain,sea", "terrain", "sea"]
-        .map(|layers| drawn("world", "view", &format!("{eye} --background ff00ff --layer {layers}")));
     let is_empty = |p: &[u8]| p == [255, 0, 255, 255];
     let (mut of_sea, mut of_ground) = (0, 0);
     for ((all, ground), sea) in all.chunks(4).zip(ground.chunks(4)).zip(sea.chunks(4)) {
