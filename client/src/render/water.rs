@@ -82,7 +82,7 @@ fn waves(longest: f64, strength: f64, seconds: f64, eye: DVec2) -> [[f32; 4]; WA
         // Deep water: the square of the speed grows with the length.
         let phase = turn * direction.dot(eye) - (GRAVITY * turn).sqrt() * seconds + 1.7 * part;
         let vector = direction * turn;
-        let slope = 0.02 * strength;
+        let slope = 0.012 * strength;
         [single(vector.x), single(vector.y), single(phase.rem_euclid(std::f64::consts::TAU)), single(slope)]
     })
 }
