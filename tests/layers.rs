@@ -62,7 +62,7 @@ fn write_asc(
 /// A swell with an island, and nothing in the east.
 fn swell(i: u32, j: u32) -> Option<f64> {
     let (x, y) = (f64::from(i), f64::from(j));
-    let is_dry = (x - 60.0).hypot(y - 40.0) < 17.0 || i > 100 && (i + j) % 3 == 0 || i > 150;
+    let is_dry = (x - 60.0).hypot(y - 40.0) < 17.0 || i > 100 && (i + j).is_multiple_of(3) || i > 150;
     (!is_dry).then(|| ((2.0 + (x / 5.0).sin() * (y / 7.0).cos()) * 100.0).round() / 100.0)
 }
 

@@ -223,14 +223,17 @@ pub struct Source {
 /// Where heights come from.
 enum Heights {
     /// Files.
-    Files {
-        mosaic: Mosaic,
-        reprojection: Option<Reprojection>,
-        /// Whether the user says that no value stands for "no data".
-        all_heights: bool,
-    },
+    Files(Box<Files>),
     /// The same everywhere: 0, above the grid's offset.
     Level,
+}
+
+/// The opened files of a layer.
+struct Files {
+    mosaic: Mosaic,
+    reprojection: Option<Reprojection>,
+    /// Whether the user says that no value stands for "no data".
+    all_heights: bool,
 }
 
 impl fmt::Debug for Source {
@@ -274,7 +277,8 @@ fn open_with(
     check_grid(first, &grid)?;
     let identity = identity(paths, options, &grid)?;
     let all_heights = options.nodata.is_some_and(f64::is_nan);
-    Ok(Source { grid, identity, heights: Heights::Files { mosaic, reprojection, all_heights }, base, cache })
+    let heights = Heights::Files(Box::new(Files { mosaic, reprojection, all_heights }));
+    Ok(Source { grid, identity, heights, base, cache })
 }
 
 /// What tells this source from others without reading it.
@@ -302,9 +306,9 @@ impl Source {
     /// # Errors
     /// When there was: it would become a pit or a spire.
     pub fn check_nodata(&self) -> std::result::Result<(), IngestError> {
-        let Heights::Files { mosaic, all_heights, .. } = &self.heights else { return Ok(()) };
-        match mosaic.suspect() {
-            Some((file, value, [low, high])) if !all_heights => Err(bad_options(
+        let Heights::Files(files) = &self.heights else { return Ok(()) };
+        match files.mosaic.suspect() {
+            Some((file, value, [low, high])) if !files.all_heights => Err(bad_options(
                 file,
                 format!("heights about as far apart as the others, which are {low} to {high}"),
                 format!("{value}, which usually means \"no data\" and is not declared here"),
@@ -358,10 +362,10 @@ impl Source {
             return Ok(());
         }
         match &self.heights {
-            Heights::Files { mosaic, reprojection: Some(reprojection), .. } => {
-                reprojection.read(mosaic, window, out)
-            }
-            Heights::Files { mosaic, .. } => mosaic.read(window, out),
+            Heights::Files(files) => match &files.reprojection {
+                Some(reprojection) => reprojection.read(&files.mosaic, window, out),
+                None => files.mosaic.read(window, out),
+            },
             Heights::Level => {
                 out.fill(0.0);
                 Ok(())
