@@ -223,11 +223,22 @@ impl Viewer {
         if let Some(ground) = ground {
             self.controls.stay_above(ground, CLEARANCE_CELLS * self.cell());
         }
+        let reloads = self.frame.stats.reloads;
         self.frame = self.terrain.frame(self.controls.camera());
+        if self.frame.stats.reloads != reloads {
+            self.go_over();
+        }
         self.history.note(seconds, &self.frame);
         if !self.frame.complete || self.frame.moving > 0 || self.controls.is_gliding() {
             ui.ctx().request_repaint();
         }
+    }
+
+    /// Forgets what was of the version of the scene before: layers may be others now, and lie elsewhere.
+    fn go_over(&mut self) {
+        self.frozen = None;
+        self.marks.clear();
+        self.visible.resize(self.terrain.scene().layers.len(), true);
     }
 
     /// Metres of the finest layer's cells.

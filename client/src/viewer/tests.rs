@@ -14,7 +14,7 @@ struct Hand {
     viewer: Viewer,
     context: egui::Context,
     seconds: f64,
-    _served: Served,
+    served: Served,
 }
 
 impl Hand {
@@ -23,7 +23,7 @@ impl Hand {
         let terrain =
             Terrain::open(&served.url, Options { fetch: fetch::Options::default(), ..Options::default() });
         let viewer = Viewer::new(terrain.unwrap(), &served.url, Look::default(), SIZE, camera);
-        let mut hand = Self { viewer, context: egui::Context::default(), seconds: 0.0, _served: served };
+        let mut hand = Self { viewer, context: egui::Context::default(), seconds: 0.0, served };
         hand.settle();
         hand
     }
@@ -273,4 +273,28 @@ fn a_frozen_cut_stays_while_the_eye_moves() {
     assert_ne!(items(&hand.viewer), before);
     hand.viewer.visible[0] = false;
     assert!(hand.viewer.items().is_empty());
+}
+
+/// What was frozen of a scene before was drawn where the layers of the one after it lie, and a mark on a layer that the other
+/// has not ended the program.
+#[test]
+fn nothing_of_a_scene_before_outlives_it() {
+    let mut hand = Hand::new(Some(looking_down()));
+    let place = hand.viewer.camera().target;
+    hand.viewer.marks.push(Mark { place, error: None, layer: 0 });
+    hand.viewer.frozen = Some(hand.viewer.items());
+    hand.viewer.visible.clear();
+    hand.served.misbehave(Faults { gone: true, ..Faults::default() });
+    hand.viewer.terrain.set_tolerance_pixels(0.3);
+    let until = Instant::now() + Duration::from_secs(60);
+    while hand.viewer.frame().stats.reloads == 0 {
+        hand.frame(&[]);
+        if hand.viewer.terrain.scene_changed() {
+            hand.served.misbehave(Faults::default());
+        }
+        assert!(Instant::now() < until, "{:?}", hand.viewer.terrain.problem());
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    assert!(hand.viewer.marks().is_empty() && hand.viewer.frozen.is_none());
+    assert!(!hand.viewer.items().is_empty(), "its layers are seen");
 }
