@@ -46,8 +46,7 @@ fn users_of_a_server_by_itself_find_all_they_want() {
 #[test]
 fn triangles_load_a_server_as_well() {
     let world = World::whole_with_triangles(257);
-    let report =
-        load(&world.served.scene("world"), &Options { encoding: Encoding::Tin, ..options(6) });
+    let report = load(&world.served.scene("world"), &Options { encoding: Encoding::Tin, ..options(6) });
     assert!(report.errors.is_empty() && report.views.count > 0 && report.decoded.0 > 0, "{report:?}");
 }
 
