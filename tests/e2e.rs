@@ -7,12 +7,18 @@
     reason = "a test that cannot go on has failed, and its numbers are small"
 )]
 
+/// Stores that cannot be read, or not right: what is said, counted, logged, served all the same, and served again.
+mod bad_store;
+/// The seeds of the fuzzer, for every decoder.
+mod corpora;
 /// The same input gives the same bytes, whatever the threads and the memory.
 mod determinism;
 /// What `doctor` says of servers, and of proxies before them.
 mod doctor;
 /// The papers' tables on real ground.
 mod experiments;
+/// Answers that are spoilt on their way, servers that end, and scenes that change: the client comes to the same picture.
+mod faults;
 /// The first view over a slow link: how soon, and never worse while the eye stands still.
 mod first_view;
 /// Heights asked for: every sample, and places between.
@@ -21,12 +27,12 @@ mod heights;
 mod hostile;
 /// What the server answers to whom: routes, caches, refusals, heights.
 mod http;
+/// Law 7, at fifty moments: killed, a build leaves the scene before or a whole new one, for readers and for servers.
+mod killed;
 /// Several layers in one scene: built, resumed, served, drawn, refused.
 mod layers;
 /// Who asks too much, too slowly or for nothing does not disturb the others.
 mod limits;
-/// The seeds of the fuzzer, for every decoder.
-mod corpora;
 /// A slow and distant link, and that it is as slow and distant as asked.
 mod link;
 /// Many users at once.
@@ -35,6 +41,8 @@ mod load;
 mod progressive;
 /// Law 7: a build that was killed, stopped or ran out of disk goes on; the bytes are those of an unbroken one.
 mod resume;
+/// A proxy that spoils answers in all ways.
+mod rough;
 /// Law 2: any cut of a built store, with anything missing, has no cracks.
 mod seams;
 /// What an operator relies on: headers, counters, logs, encryption, tokens, rates, settings.

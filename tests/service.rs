@@ -226,16 +226,22 @@ fn a_damaged_blob_is_never_served_and_the_rest_of_its_batch_is() {
 }
 
 /// The real server, with all that it says.
-struct Program {
+pub(crate) struct Program {
     child: std::process::Child,
-    address: String,
+    /// `http://127.0.0.1:PORT`.
+    pub(crate) address: String,
     log: std::thread::JoinHandle<String>,
 }
 
 impl Program {
-    fn start(args: &[&str], variables: &[(&str, &str)]) -> Self {
+    pub(crate) fn start(args: &[&str], variables: &[(&str, &str)]) -> Self {
+        Self::start_at("127.0.0.1:0", args, variables)
+    }
+
+    /// The same, at an address that may be another's that has ended.
+    pub(crate) fn start_at(listen: &str, args: &[&str], variables: &[(&str, &str)]) -> Self {
         let mut command = Command::new(&programs().server);
-        command.arg("serve").args(args).args(["--listen", "127.0.0.1:0"]);
+        command.arg("serve").args(args).args(["--listen", listen]);
         command.envs(variables.iter().copied()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = command.spawn().unwrap();
         let mut first = String::new();
@@ -250,8 +256,15 @@ impl Program {
         Self { child, address, log }
     }
 
+    /// Kills it, and says what it wrote to its log.
+    pub(crate) fn kill(mut self) -> String {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+        self.log.join().unwrap()
+    }
+
     /// Stops it, and says what it wrote to its log.
-    fn stop(mut self) -> String {
+    pub(crate) fn stop(mut self) -> String {
         let _ = Command::new("kill").arg(self.child.id().to_string()).status();
         assert!(self.child.wait().unwrap().success());
         self.log.join().unwrap()

@@ -36,7 +36,7 @@ fn wait(what: &str, mut is_done: impl FnMut() -> bool) {
 }
 
 /// Puts another version into a store's folder as a build does: its files first, then `scene.json` at once.
-fn publish(from: &Path, to: &Path, version: &str, damage: bool) {
+pub(crate) fn publish(from: &Path, to: &Path, version: &str, damage: bool) {
     std::fs::create_dir(to.join(version)).unwrap();
     for entry in std::fs::read_dir(from.join(version)).unwrap() {
         let path = entry.unwrap().path();
@@ -99,7 +99,7 @@ fn a_scene_built_again_is_swapped_and_a_damaged_one_is_not() {
 }
 
 /// What a view draws, and how high.
-fn drawn(view: &FrameView) -> Vec<(Diamond, u8, Vec<i32>)> {
+pub(crate) fn drawn(view: &FrameView) -> Vec<(Diamond, u8, Vec<i32>)> {
     let mut items: Vec<_> = view
         .items
         .iter()

@@ -80,16 +80,20 @@ pub fn framed(terrain: &mut Terrain, size: [u32; 2], exaggeration: f64, patience
     let wide = stretched(&camera, exaggeration);
     terrain.set_exaggeration(exaggeration);
     let until = Instant::now() + patience;
-    let view = loop {
+    // Always the same form of it, whatever else has arrived: where the camera stands is no matter of the network.
+    let outline_pixels = OUTLINE_PIXELS.max(terrain.tolerance_pixels());
+    let items = loop {
         let view = terrain.frame(&wide);
-        if view.complete || view.error_pixels <= OUTLINE_PIXELS || Instant::now() >= until {
-            break view;
+        let is_enough = view.complete || view.error_pixels <= outline_pixels;
+        let outline = if is_enough { terrain.drawn_at(&wide, outline_pixels) } else { None };
+        if outline.is_some() || view.complete || Instant::now() >= until {
+            break outline.unwrap_or(view.items);
         }
         std::thread::sleep(Duration::from_millis(2));
     };
     let layers = &terrain.scene().layers;
     let mut points = Vec::new();
-    for item in &view.items {
+    for item in &items {
         let layer = &layers[item.layer];
         match &*item.surface {
             Surface::Points(here) => points.extend(points_of(layer, item.diamond, here.block())),
@@ -480,7 +484,6 @@ pub fn fly(
     mut each: impl FnMut(&FrameLine, Option<&Picture>) -> Result<(), HeadlessError>,
 ) -> Result<(), HeadlessError> {
     let mut offscreen = Offscreen::new(options)?;
-    let layers = terrain.scene().layers.clone();
     terrain.set_exaggeration(look.exaggeration);
     let started = Instant::now();
     for frame in 0..flight.frames {
@@ -503,7 +506,8 @@ pub fn fly(
         // Waves move in the path's time, too.
         let mut look = *look;
         look.water.seconds += seconds;
-        let stats = offscreen.draw(&layers, &drawn, &view.items, &look)?;
+        // Of this frame's version: another may have taken over, and lie elsewhere.
+        let stats = offscreen.draw(&terrain.scene().layers, &drawn, &view.items, &look)?;
         let picture = if flight.reads || flight.pictures.is_some() {
             Some(offscreen.read()?)
         } else {

@@ -511,6 +511,31 @@ impl Terrain {
         view
     }
 
+    /// What a cut at another tolerance would draw, if all of it is there, whatever else is. Asks for nothing.
+    #[cfg(not(target_arch = "wasm32"))]
+    pub(crate) fn drawn_at(&self, camera: &Camera, tolerance_pixels: f64) -> Option<Vec<DrawItem>> {
+        let mut items = Vec::new();
+        for (number, state) in self.layers.iter().enumerate() {
+            let ask = Ask {
+                layer: &self.scene.layers[number],
+                encoding: self.options.fetch.encoding,
+                camera,
+                exaggeration: self.options.exaggeration,
+                tolerance_pixels,
+                sight: self.options.sight,
+                seen: None,
+                memory_bytes: state.memory_bytes,
+            };
+            let ideal = cut::choose(&ask, |d| state.index.get(d));
+            let drawing = cut::draw(number, &ask, &ideal, |d| self.cache.get((number, d)).cloned());
+            if !drawing.wishes.is_empty() || !ideal.pages().is_empty() {
+                return None;
+            }
+            items.extend(drawing.items);
+        }
+        Some(items)
+    }
+
     /// Repeats frames until all that the ideal cut wants is there and stands still, or nothing more can come, or the
     /// time is up. For pictures without a window.
     #[cfg(not(target_arch = "wasm32"))]

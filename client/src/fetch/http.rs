@@ -14,12 +14,19 @@ use reqwest::{Client, Response, StatusCode, Url};
 use std::hash::BuildHasher;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
+use web_time::Instant;
 
 /// The pause after the first failure; it doubles with each, up to [`PAUSE_MAX`].
 const PAUSE: Duration = Duration::from_millis(100);
 
 /// The longest pause, also where the server asks for a longer one.
 const PAUSE_MAX: Duration = Duration::from_secs(10);
+
+/// Times that a scene's description is asked for that does not come whole: half a second at most without a server.
+const OPENINGS_MAX: u32 = 3;
+
+/// How long it is asked for again.
+const OPENING: Duration = Duration::from_secs(5);
 
 /// The largest answer in JSON, in bytes.
 const JSON_BYTES_MAX: usize = 4 << 20;
@@ -228,6 +235,7 @@ impl Http {
     /// The description of the scene of this name, or of the only one.
     pub(super) async fn scene(&self, name: Option<&str>) -> Result<Scene, FetchError> {
         count(&self.traffic.round_trips, 1);
+        let started = Instant::now();
         let mut tries = 0;
         let scene = loop {
             let answer = match name {
@@ -235,13 +243,19 @@ impl Http {
                 None => self.json::<Catalogue>("/scenes").await.and_then(only),
             };
             tries += 1;
-            match answer {
-                Err(FetchError::Status { status: 429 | 500.., retry_after, .. }) if tries < TRIES_MAX => {
-                    count(&self.traffic.errors, 1);
-                    sleep(pause(tries, retry_after)).await;
+            let (tries_max, asked) = match &answer {
+                Err(FetchError::Status { status: 429 | 500.., retry_after, .. }) => (TRIES_MAX, *retry_after),
+                // Cut off on the way, or garbled; but who has the address wrong is not kept waiting.
+                Err(FetchError::Transport(_) | FetchError::Json { .. }) if started.elapsed() < OPENING => {
+                    (OPENINGS_MAX, None)
                 }
-                answer => break answer?,
+                _ => (0, None),
+            };
+            if tries >= tries_max {
+                break answer?;
             }
+            count(&self.traffic.errors, 1);
+            sleep(pause(tries, asked)).await;
         };
         check(&scene).map_err(|reason| FetchError::Scene { scene: shortened(&scene.name), reason })?;
         Ok(scene)

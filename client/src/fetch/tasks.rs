@@ -320,8 +320,13 @@ impl Shared {
         match done {
             None => count(&self.http.traffic.cancelled, 1),
             Some(Ok(())) => {}
-            // Cut off, but not in vain: what it owes has not failed in itself.
-            Some(Err(FetchError::Early(_) | FetchError::Transport(_))) if useful => {
+            // Cut off, or garbled from some byte on, but not in vain: what it owes has not failed in itself.
+            Some(Err(
+                FetchError::Early(_)
+                | FetchError::Transport(_)
+                | FetchError::Wire(_)
+                | FetchError::Unasked(_),
+            )) if useful => {
                 count(&self.http.traffic.errors, 1);
                 let not_before = Instant::now() + pause(1, None);
                 for key in owed {

@@ -102,7 +102,8 @@ mod tests {
     #[test]
     fn what_leads_nowhere_is_left_out() {
         let good = Bookmark { name: "summit".into(), view: "1.00,2.00,3.00,0.000,-20.000".into() };
-        let text = serde_json::to_string(&[&good, &Bookmark { name: "x".into(), view: "here".into() }]).unwrap();
+        let text =
+            serde_json::to_string(&[&good, &Bookmark { name: "x".into(), view: "here".into() }]).unwrap();
         assert_eq!(read(&text), [good]);
         assert!(read("").is_empty() && read("{}").is_empty());
     }

@@ -169,7 +169,11 @@ fn plot(profile: &Profile, ui: &mut Ui) {
     corner(Align2::LEFT_BOTTOM, format!("{low:.1} m"));
     if let (Some(pointer), Some([first, last])) = (response.hover_pos(), profile.ends) {
         let part = f64::from(((pointer.x - rect.left()) / rect.width()).clamp(0.0, 1.0));
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "from 0 to 1 of so many steps")]
+        #[allow(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "from 0 to 1 of so many steps"
+        )]
         let i = (part * steps as f64).round() as usize;
         if let Some(Some(height)) = profile.heights.get(i) {
             painter.circle_filled(at(i, *height), 3.0, ui.visuals().strong_text_color());

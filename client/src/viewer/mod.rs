@@ -33,10 +33,10 @@ use crate::overview;
 use crate::pick::{Hit, Picker, Ray};
 use crate::render::{FrameStats, Look};
 use crate::terrain::{FrameView, Terrain};
+use bookmarks::Bookmarks;
 use diamantina_protocol::message::Kind;
 use egui::{Event, Key, Modifiers, PointerButton, Sense, Ui};
 use glam::{DVec2, DVec3};
-use bookmarks::Bookmarks;
 use measure::{Globe, Profile};
 use panel::History;
 use std::path::PathBuf;
@@ -236,7 +236,11 @@ impl Viewer {
         if let Some(ground) = ground {
             self.controls.stay_above(ground, CLEARANCE_CELLS * self.cell());
         }
+        let reloads = self.frame.stats.reloads;
         self.frame = self.terrain.frame(self.controls.camera());
+        if self.frame.stats.reloads != reloads {
+            self.go_over();
+        }
         measure::follow(self);
         if self.shows_boxes {
             boxes::show(self, ui);
@@ -249,6 +253,14 @@ impl Viewer {
         if !self.frame.complete || self.frame.moving > 0 || self.controls.is_gliding() || has_waves {
             ui.ctx().request_repaint();
         }
+    }
+
+    /// Forgets what was of the version of the scene before: layers may be others now, and lie elsewhere.
+    fn go_over(&mut self) {
+        self.frozen = None;
+        self.marks.clear();
+        self.profile = Profile::default();
+        self.globe = Globe::of(&self.terrain.scene().frame);
     }
 
     /// Whether there is water in view whose waves move.

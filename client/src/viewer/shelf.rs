@@ -29,7 +29,8 @@ impl Shelf {
         let Some(path) = &self.path else { return Ok(Map::new()) };
         match std::fs::read(path) {
             Ok(bytes) => serde_json::from_slice(&bytes).map_err(|e| {
-                let found = format!("{}: expected bookmarks as JSON ({e}): mend it or move it away", path.display());
+                let found =
+                    format!("{}: expected bookmarks as JSON ({e}): mend it or move it away", path.display());
                 io::Error::new(io::ErrorKind::InvalidData, found)
             }),
             Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(Map::new()),
@@ -47,7 +48,10 @@ impl Shelf {
     pub(super) fn keep(&self, text: &str) -> io::Result<()> {
         let mut all = self.all()?;
         let path = self.path.as_ref().ok_or_else(|| {
-            io::Error::new(io::ErrorKind::NotFound, "there is no folder of settings: set XDG_CONFIG_HOME or HOME")
+            io::Error::new(
+                io::ErrorKind::NotFound,
+                "there is no folder of settings: set XDG_CONFIG_HOME or HOME",
+            )
         })?;
         all.insert(self.scene.clone(), serde_json::from_str(text)?);
         let told = |e: io::Error| io::Error::new(e.kind(), format!("{}: {e}", path.display()));
@@ -68,7 +72,8 @@ mod tests {
     fn scenes_have_bookmarks_of_their_own() {
         let folder = tempfile::tempdir().unwrap();
         let path = Some(folder.path().join("new").join("bookmarks.json"));
-        let [alps, moon] = ["http://a/scenes/alps", "http://a/scenes/moon"].map(|s| Shelf::at(path.clone(), s));
+        let [alps, moon] =
+            ["http://a/scenes/alps", "http://a/scenes/moon"].map(|s| Shelf::at(path.clone(), s));
         assert!(alps.recall().unwrap().is_empty());
         let one = |name: &str| Bookmark { name: name.into(), view: "1,2,3,4,-5".into() };
         let text = |list: &[Bookmark]| serde_json::to_string(list).unwrap();

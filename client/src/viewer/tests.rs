@@ -14,7 +14,7 @@ struct Hand {
     viewer: Viewer,
     context: egui::Context,
     seconds: f64,
-    _served: Served,
+    served: Served,
 }
 
 impl Hand {
@@ -23,7 +23,7 @@ impl Hand {
         let terrain =
             Terrain::open(&served.url, Options { fetch: fetch::Options::default(), ..Options::default() });
         let viewer = Viewer::new(terrain.unwrap(), &served.url, Look::default(), SIZE, camera);
-        let mut hand = Self { viewer, context: egui::Context::default(), seconds: 0.0, _served: served };
+        let mut hand = Self { viewer, context: egui::Context::default(), seconds: 0.0, served };
         hand.settle();
         hand
     }
@@ -365,11 +365,35 @@ fn boxes_are_drawn_around_what_is_drawn() {
         };
         let viewer = &mut hand.viewer;
         let output = hand.context.run_ui(input, |ui| viewer.update(ui));
-        let lines = output.shapes.iter().filter(|s| matches!(s.shape, egui::Shape::LineSegment { .. })).count();
+        let lines =
+            output.shapes.iter().filter(|s| matches!(s.shape, egui::Shape::LineSegment { .. })).count();
         output.drop_without_applying_deltas();
         lines
     };
     let without = lines(&mut hand);
     hand.viewer.shows_boxes = true;
     assert!(lines(&mut hand) >= without + 12);
+}
+
+/// What was frozen of a scene before was drawn where the layers of the one after it lie, and a mark on a layer that the other
+/// has not ended the program.
+#[test]
+fn nothing_of_a_scene_before_outlives_it() {
+    let mut hand = Hand::new(Some(looking_down()));
+    let place = hand.viewer.camera().target;
+    hand.viewer.marks.push(Mark { place, lonlat: None, error: None, layer: 0 });
+    hand.viewer.frozen = Some(hand.viewer.items());
+    hand.served.misbehave(Faults { gone: true, ..Faults::default() });
+    hand.viewer.terrain.set_tolerance_pixels(0.3);
+    let until = Instant::now() + Duration::from_secs(60);
+    while hand.viewer.frame().stats.reloads == 0 {
+        hand.frame(&[]);
+        if hand.viewer.terrain.scene_changed() {
+            hand.served.misbehave(Faults::default());
+        }
+        assert!(Instant::now() < until, "{:?}", hand.viewer.terrain.problem());
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    assert!(hand.viewer.marks().is_empty() && hand.viewer.frozen.is_none());
+    assert!(!hand.viewer.items().is_empty(), "its layers are seen");
 }

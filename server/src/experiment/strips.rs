@@ -133,7 +133,8 @@ fn means(run: &Run<'_>, sums: &[Vec<(Strategy, [usize; 5])>]) -> Table {
         let compact = list.iter().filter(|(strategy, _)| *strategy == Strategy::Compact).count();
         let mean = |i: usize| list.iter().map(|(_, c)| c[i] as f64).sum::<f64>() / list.len().max(1) as f64;
         let saved = |i: usize| {
-            let each = list.iter().map(|(_, c)| 100.0 * (1.0 - c[i] as f64 / c[2] as f64)).collect::<Vec<_>>();
+            let each =
+                list.iter().map(|(_, c)| 100.0 * (1.0 - c[i] as f64 / c[2] as f64)).collect::<Vec<_>>();
             [mean_and_spread(&each)[0], 100.0 * (1.0 - mean(i) / mean(2))].map(|p| format!("{p:.1}"))
         };
         let counts = [0, 1, 2, 3].map(|i| format!("{:.1}", mean(i)));

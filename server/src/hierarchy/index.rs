@@ -6,7 +6,7 @@ use super::tallies::{PerDiamond, Tallies, Tally};
 use super::tins::BEHIND;
 use super::transcribe::Stats;
 use super::{Build, BuildError, LayerSource, Options};
-use crate::store::{Key, Kind as BlobKind};
+use crate::store::{Key, Kind as BlobKind, compress};
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::index::{self, Entry};
 use diamantina_protocol::message::Layer;
@@ -97,7 +97,7 @@ impl Build<'_> {
             }
             let diamonds = index::page_diamonds(forest, page).unwrap_or_default();
             let list: Vec<Entry> = diamonds.iter().map(|d| entries.get(*d)).collect();
-            let blob = zstd::bulk::compress(&index::encode(&list), 12).map_err(self.work.failure())?;
+            let blob = compress(&index::encode(&list)).map_err(self.work.failure())?;
             let key = Key { layer: self.number, kind, a: page, b: 0 };
             self.work.writer.put(key, behind | u64::from(page), &blob)?;
             progress.advance(1);

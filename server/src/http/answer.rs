@@ -51,6 +51,13 @@ impl Refusal {
         let detail = "where this comes from cannot be reached now: ask again in a moment";
         Self { later: Some(AWAY_RETRY_AFTER), ..Self::new(StatusCode::SERVICE_UNAVAILABLE, detail) }
     }
+
+    /// The system does not give what is served here. The log says why.
+    fn unread(cause: &StoreError) -> Self {
+        let detail = "this cannot be read here: the log says why";
+        let refusal = Self::new(StatusCode::INTERNAL_SERVER_ERROR, detail);
+        Self { cause: Some(Cause(cause.to_string().into())), ..refusal }
+    }
 }
 
 impl IntoResponse for Refusal {
@@ -73,10 +80,15 @@ impl IntoResponse for Refusal {
 
 impl From<StoreError> for Refusal {
     fn from(error: StoreError) -> Self {
-        if matches!(error, StoreError::Away { .. }) {
-            return Self::away();
+        match &error {
+            // The log says it once, of the store.
+            StoreError::Away { .. } => Self::away(),
+            StoreError::Unanswered { .. } => {
+                Self { cause: Some(Cause(error.to_string().into())), ..Self::away() }
+            }
+            StoreError::Unread { .. } => Self::unread(&error),
+            _ => Self::damaged(&error),
         }
-        Self::damaged(&error)
     }
 }
 

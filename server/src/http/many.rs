@@ -21,6 +21,9 @@ const PIECE_BYTES: usize = 16 << 10;
 /// How long before it is cut off an answer with something damaged waits for its bytes to go out.
 const FAREWELL: Duration = Duration::from_millis(100);
 
+/// Things of an answer that could not be had, of which the log tells by name.
+const NAMED_MAX: usize = 16;
+
 /// Diamonds of a batch that are asked of an object store at once.
 const AHEAD: usize = 64;
 
@@ -38,9 +41,32 @@ struct Progress {
     batch: Batch,
     next: usize,
     damaged: Vec<[u32; 2]>,
-    last_error: Option<String>,
+    errors: Errors,
     /// What an object store was asked for ahead.
     at_hand: HashMap<Key, Read>,
+}
+
+/// What went wrong with an answer.
+#[derive(Default)]
+struct Errors {
+    named: Vec<String>,
+    more: usize,
+}
+
+impl Errors {
+    fn add(&mut self, error: String) {
+        if self.named.len() < NAMED_MAX {
+            self.named.push(error);
+        } else {
+            self.more += 1;
+        }
+    }
+
+    /// All of it in words, if there is anything.
+    fn told(&self) -> Option<String> {
+        let more = if self.more > 0 { format!("; and {} more", self.more) } else { String::new() };
+        (!self.named.is_empty()).then(|| self.named.join("; ") + &more)
+    }
 }
 
 /// The body of a batch.
@@ -49,7 +75,7 @@ struct Progress {
 /// When it comes from an object store that cannot be reached: then nothing has been sent, and 503 can be said.
 pub(super) async fn batch(batch: Batch) -> Result<Body, Refusal> {
     let at_hand = HashMap::new();
-    let mut begun = Progress { batch, next: 0, damaged: Vec::new(), last_error: None, at_hand };
+    let mut begun = Progress { batch, next: 0, damaged: Vec::new(), errors: Errors::default(), at_hand };
     begun.fetch().await;
     if begun.at_hand.values().any(|read| matches!(read, Err(StoreError::Away { .. }))) {
         return Err(Refusal::away());
@@ -82,7 +108,7 @@ pub(super) async fn batch(batch: Batch) -> Result<Body, Refusal> {
         if !piece.is_empty() {
             return Some((Ok(Bytes::from(piece)), Some(progress)));
         }
-        let error = progress.last_error?;
+        let error = progress.errors.told()?;
         // What was written goes out before the connection is dropped.
         tokio::time::sleep(FAREWELL).await;
         Some((Err(io::Error::other(error)), None))
@@ -129,42 +155,45 @@ impl Progress {
                 Ok(None) => FrameHeader::without(*centre, Status::Missing).write(piece),
                 Ok(Some(_)) => {
                     self.damaged.push(*centre);
-                    self.last_error = Some(format!("{key:?} is larger than any payload"));
+                    self.errors.add(format!("{key:?} is larger than any payload"));
                 }
                 // What is to come is there, though not now: cut off, the answer is asked for again.
                 Err(error @ StoreError::Away { .. }) => {
                     self.next = centres.len();
-                    self.last_error = Some(error.to_string());
+                    self.errors.add(error.to_string());
                 }
                 Err(error) => {
                     self.damaged.push(*centre);
-                    self.last_error = Some(error.to_string());
+                    self.errors.add(error.to_string());
                 }
             }
         }
     }
 }
 
-/// The body of a stream. Each piece is made when the one before has gone out, on a thread that it leaves at once: a
-/// slow reader keeps what the stream remembers and one piece, and no thread.
+/// The body of a stream. The first piece is made before anything is answered, so that what cannot be had is said by a
+/// status; each further one when the one before has gone out, on a thread that it leaves at once: a slow reader keeps what the
+/// stream remembers and one piece, and no thread.
 ///
 /// # Errors
-/// As [`batch`].
-pub(super) async fn stream(stream: Stream, blobs: &Arc<Blobs>, is_remote: bool) -> Result<Body, Refusal> {
-    let mut begun = (stream, Arc::clone(blobs), None);
-    if is_remote {
-        let (stream, blobs, _) = begun;
-        let made = make(stream).await;
-        if let Ok((Err(InspectError::Store(StoreError::Away { .. })), _)) = made {
-            return Err(Refusal::away());
+/// When not even the first piece can be had.
+pub(super) async fn stream(stream: Stream, blobs: &Arc<Blobs>) -> Result<Body, Refusal> {
+    let (piece, stream) = match make(stream).await {
+        Ok((Ok(Some(piece)), stream)) => (piece, stream),
+        Ok((Ok(None), _)) => return Ok(Body::empty()),
+        Ok((Err(InspectError::Store(error)), _)) => {
+            blobs.failed(&error);
+            return Err(error.into());
         }
-        let Ok((piece, stream)) = made else { return Ok(Body::empty()) };
-        begun = (stream, blobs, Some(piece));
-    }
+        Ok((Err(error), _)) => return Err(Refusal::damaged(&error)),
+        // The runtime ends, and nobody waits for this.
+        Err(error) => return Err(Refusal::damaged(&error)),
+    };
+    let begun = (stream, Arc::clone(blobs), Some(piece));
     Ok(Body::from_stream(futures_util::stream::unfold(Some(begun), |begun| async move {
         let (stream, blobs, first) = begun?;
         let made = match first {
-            Some(piece) => Ok((piece, stream)),
+            Some(piece) => Ok((Ok(Some(piece)), stream)),
             None => make(stream).await,
         };
         match made {

@@ -54,7 +54,7 @@ const STREAM: About = About {
         ("sides", false, Form::Numbers),
         ("vertical", false, Form::Text),
     ],
-    ..below("A region or a view, the largest errors first, in frames", &[400, 404, 410])
+    ..below("A region or a view, the largest errors first, in frames", &[400, 404, 410, 500])
 };
 
 const HEIGHT: About = About {
@@ -413,7 +413,7 @@ async fn stream(
     let stream = Stream::new(Arc::clone(&store), number, layer, ask, STREAM_MAX);
     let mut response = tagged(&headers, &tag, cache, OCTETS, Body::empty);
     if response.status() == StatusCode::OK {
-        *response.body_mut() = many::stream(stream, &site.blobs, store.is_remote()).await?;
+        *response.body_mut() = many::stream(stream, &site.blobs).await?;
     }
     Ok(response)
 }
@@ -426,6 +426,7 @@ async fn height_at(
 ) -> Result<Response, Refusal> {
     let store = find_scene(&site, caller, &name)?;
     points(find_layer(&store, &layer)?.1)?;
+    let blobs = Arc::clone(&site.blobs);
     let number = |key: &str| -> Result<Option<f64>, Refusal> {
         let Some(text) = query.get(key) else { return Ok(None) };
         let value = text.parse::<f64>().ok().filter(|v| v.is_finite());
@@ -445,7 +446,12 @@ async fn height_at(
             }
         };
         let (number, layer) = find_layer(&store, &layer)?;
-        height::height(&store, number, layer, crs, place).map_err(refuse_height)
+        height::height(&store, number, layer, crs, place).map_err(|error| {
+            if let HeightError::Store(error) = &error {
+                blobs.failed(error);
+            }
+            refuse_height(error)
+        })
     });
     let answer = answer
         .await

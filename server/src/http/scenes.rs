@@ -103,7 +103,7 @@ impl Scenes {
                 Ok(None) => continue,
                 Ok(Some(version)) => version,
                 // That is told elsewhere, and says nothing of what is published.
-                Err(StoreError::Away { .. }) => continue,
+                Err(StoreError::Away { .. } | StoreError::Unanswered { .. }) => continue,
                 Err(error) => {
                     self.refuse_once(name, "", || refuse("", &error));
                     continue;
@@ -124,6 +124,10 @@ impl Scenes {
                     });
                 }
                 Ok(newer) => refuse(&version, &format!("it is of a scene named '{}'", newer.scene().name)),
+                // It is looked at again the next time.
+                Err(error @ (StoreError::Away { .. } | StoreError::Unanswered { .. })) => {
+                    tracing::warn!(scene = name, version, %error, "another version cannot be read through yet");
+                }
                 Err(error) => refuse(&version, &error),
             });
         }

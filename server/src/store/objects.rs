@@ -7,8 +7,8 @@
 //! All requests of the process run on one small runtime of their own, so that whoever waits for them may be a
 //! thread or a task of any other.
 
-use super::StoreError;
 use super::transport::Transport;
+use super::{Key, StoreError};
 use bytes::Bytes;
 use object_store::aws::AmazonS3Builder;
 use object_store::azure::MicrosoftAzureBuilder;
@@ -87,6 +87,8 @@ pub(super) enum Failure {
     Changed,
     /// The store cannot be reached, or does not do its work.
     Away(String),
+    /// It did others' work meanwhile, but not this.
+    Unanswered(String),
 }
 
 impl From<Error> for Failure {
@@ -134,6 +136,21 @@ impl Failure {
             Self::Denied(reason) => StoreError::Denied { address, reason },
             Self::Changed => StoreError::Overtaken { address },
             Self::Away(reason) => StoreError::Away { address, reason },
+            Self::Unanswered(reason) => StoreError::Unanswered { address, reason },
+        }
+    }
+
+    /// The same as an error about a blob of the pack at an address.
+    pub(super) fn of_blob(self, address: String, key: Key) -> StoreError {
+        let named = |words: String| format!("blob {key:?}: {words}");
+        match self.at(address) {
+            StoreError::Damaged { path, what } => StoreError::Damaged { path, what: named(what) },
+            StoreError::Denied { address, reason } => StoreError::Denied { address, reason: named(reason) },
+            StoreError::Unanswered { address, reason } => {
+                StoreError::Unanswered { address, reason: named(reason) }
+            }
+            // Of those away it is the store that is told of, not each blob.
+            other => other,
         }
     }
 }
@@ -167,6 +184,8 @@ pub(super) fn folder(path: &Path) -> &Path {
 struct Health {
     /// Since when, and from when on it is asked again.
     away: Option<(Instant, Instant, String)>,
+    /// Requests that it answered, whatever it said.
+    answered: u64,
 }
 
 /// Things below a prefix of a store. Cheap to share.
@@ -309,9 +328,14 @@ impl Objects {
         let _place = self.places.acquire().await;
         // Those before may have found out.
         self.is_worth_asking(true)?;
+        let answered = self.health().answered;
         let done = what.await.map_err(Failure::from);
         let mut health = self.health();
         match &done {
+            // One thing that cannot be had is no reason to refuse all others.
+            Err(Failure::Away(reason)) if health.away.is_none() && health.answered > answered => {
+                return Err(Failure::Unanswered(reason.clone()));
+            }
             Err(Failure::Away(reason)) => {
                 let now = Instant::now();
                 if let Some((_, again, last)) = &mut health.away {
@@ -322,6 +346,7 @@ impl Objects {
                 }
             }
             _ => {
+                health.answered += 1;
                 if let Some((since, ..)) = health.away.take() {
                     let seconds = since.elapsed().as_secs_f64();
                     tracing::warn!(store = %self.address, seconds, "the object store can be reached again");
@@ -435,5 +460,20 @@ mod tests {
         // What is missing is an answer.
         assert!(matches!(objects.read("b", 9).await, Err(Failure::Missing)));
         assert!(objects.away().is_none());
+    }
+
+    /// One pack that a store could not read made it count as away, and nothing else of it was served.
+    #[tokio::test]
+    async fn a_store_that_answers_others_meanwhile_is_not_away() {
+        let objects = Objects::of(Arc::new(InMemory::new()), Name::from("a"), "memory".to_owned());
+        let failed = Error::Generic { store: "x", source: "500".into() };
+        let told = objects
+            .ask(async {
+                objects.ask(async { Ok(()) }).await.unwrap();
+                Err::<(), _>(failed)
+            })
+            .await;
+        assert!(matches!(told, Err(Failure::Unanswered(reason)) if reason.contains("500")));
+        assert!(objects.away().is_none() && objects.ask(async { Ok(()) }).await.is_ok());
     }
 }

@@ -1,8 +1,8 @@
 //! Blobs of a scene that lies in an object store, by ranges of its packs.
 //!
 //! Blobs that lie near one another are asked for together. With a disk cache whole pieces of packs are asked for, and kept
-//! there. A blob that does not match its checksum is asked for once more, past the cache; the pieces that it came from are
-//! dropped.
+//! there. A blob that does not match its checksum, or of which too little came, is asked for once more, by itself and past the
+//! cache; the pieces that it came from are dropped.
 
 use super::disk::{Disk, PIECE_BYTES, Piece};
 use super::objects::{Failure, Objects};
@@ -36,7 +36,7 @@ pub struct Counts {
     pub bytes: AtomicU64,
     /// Ranges that could not be had.
     pub failures: AtomicU64,
-    /// Blobs that were asked for again since they did not match their checksums.
+    /// Blobs that were asked for again since they did not match their checksums, or came short.
     pub rereads: AtomicU64,
     /// Pieces found in the disk cache.
     pub disk_hits: AtomicU64,
@@ -132,7 +132,8 @@ impl Remote {
         for (key, place) in wanted {
             let blob = match self.assemble(&parts, place) {
                 Ok(blob) if xxh3_64(&blob) == place.checksum => Ok(blob),
-                Ok(_) => {
+                // What was asked for together with others may be there without them.
+                Ok(_) | Err(Failure::Short) => {
                     for (start, _) in self.parts_of(place) {
                         if let Some(part) = parts.get_mut(&(place.pack, start)) {
                             part.is_fresh = false;
@@ -143,7 +144,7 @@ impl Remote {
                     }
                     self.once_more(*key, place).await
                 }
-                Err(failure) => Err(failure.at(self.objects.address(&self.below(place.pack)))),
+                Err(failure) => Err(failure.of_blob(self.objects.address(&self.below(place.pack)), *key)),
             };
             blobs.push(blob);
         }
@@ -261,7 +262,8 @@ impl Remote {
         Counts::add(&self.shared.counts.rereads, 1);
         let address = || self.objects.address(&self.below(place.pack));
         let (start, end) = (u64::from(place.offset), u64::from(place.offset) + u64::from(place.bytes));
-        let blob = self.range(place.pack, start, end).await.map_err(|failure| failure.at(address()))?;
+        let blob =
+            self.range(place.pack, start, end).await.map_err(|failure| failure.of_blob(address(), key))?;
         let found = xxh3_64(&blob);
         if found == place.checksum {
             Ok(blob)

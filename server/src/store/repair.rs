@@ -166,7 +166,9 @@ impl Patient {
         let path = PathBuf::from(&below);
         let wrong = match self.read(&below).and_then(|bytes| manifest.places(&bytes, &path)) {
             Ok(places) => return Ok((places, false)),
-            Err(error @ (StoreError::Away { .. } | StoreError::Denied { .. })) => return Err(error),
+            Err(
+                error @ (StoreError::Away { .. } | StoreError::Unanswered { .. } | StoreError::Denied { .. }),
+            ) => return Err(error),
             Err(error) => error,
         };
         let Some(Copy::Store(store)) = copy else {
@@ -280,7 +282,7 @@ impl Copy {
                     match blob {
                         Ok(Some(blob)) if xxh3_64(&blob) == place.checksum => drop(found.insert(*key, blob)),
                         // The copy may be damaged, too.
-                        Ok(_) | Err(StoreError::Damaged { .. } | StoreError::Io { .. }) => {}
+                        Ok(_) | Err(StoreError::Damaged { .. } | StoreError::Unread { .. }) => {}
                         Err(error) => return Err(error),
                     }
                 }

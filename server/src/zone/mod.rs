@@ -29,7 +29,7 @@ pub mod view;
 use crate::inspect::InspectError;
 use crate::progress::Progress;
 use crate::store::zones::Zones;
-use crate::store::{Store, StoreError};
+use crate::store::{Store, StoreError, compress};
 use cast::{BEND, Eye, Optics};
 use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::message::{Kind, Layer, Scene, is_name};
@@ -282,7 +282,7 @@ pub fn add(root: &Path, options: &Options, progress: &Progress) -> Result<Report
     progress.finish();
     let seconds_casting = started.elapsed().as_secs_f64() - seconds_reading;
     let bytes = zone::encode(&masks);
-    let blob = zstd::bulk::compress(&bytes, 12).map_err(ZoneError::Compression)?;
+    let blob = compress(&bytes).map_err(ZoneError::Compression)?;
     let ceilings = parts.iter().map(|part| part.ceiling);
     let ceilings_apart =
         ceilings.clone().fold(f64::NEG_INFINITY, f64::max) - ceilings.fold(f64::INFINITY, f64::min);

@@ -43,7 +43,8 @@ impl Sums {
         let mut missing = vec![0u32; row * row];
         for (slot, height) in field.heights().iter().enumerate() {
             let at = (slot / field.row() + 1) * row + slot % field.row() + 1;
-            missing[at] = u32::from(height.is_nan()) + missing[at - 1] + missing[at - row] - missing[at - row - 1];
+            missing[at] =
+                u32::from(height.is_nan()) + missing[at - 1] + missing[at - row] - missing[at - row - 1];
         }
         let has_any = missing.last().is_some_and(|n| *n > 0);
         Self { row, sums, missing: has_any.then_some(missing) }
