@@ -12,7 +12,9 @@ pub fn run(data: &[u8]) {
     // What a client asks of each layer at once.
     for layer in &scene.layers {
         let _ = layer.forest.levels();
-        let _ = layer.forest.root_diamonds().take(4).map(|d| layer.forest.bounds(d)).count();
+        for d in layer.forest.root_diamonds().take(4) {
+            let _ = layer.forest.bounds(d);
+        }
         let _ = diamantina_protocol::index::pages(&layer.forest);
     }
 }
