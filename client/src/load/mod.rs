@@ -2,7 +2,7 @@
 //!
 //! Each has a cut, an index and a cache of its own, as the viewer has, and connections of its own, and looks at one
 //! place after another with time to think between. What it asks for follows from its cut; what it is sent is checked:
-//! checksums, the index's sizes, and by decoding ([`ledger`]). Nothing is drawn.
+//! checksums, the index's sizes, and by decoding (`ledger`). Nothing is drawn.
 //!
 //! A request's latency is from when it is sent to its answer's last byte, a diamond's to its own last byte. A view has settled when
 //! all is there that its cut wants.
