@@ -71,9 +71,9 @@ mod tests {
     #[test]
     fn scenes_have_bookmarks_of_their_own() {
         let folder = tempfile::tempdir().unwrap();
-        let path = Some(folder.path().join("new").join("bookmarks.json"));
+        let file = folder.path().join("new").join("bookmarks.json");
         let [alps, moon] =
-            ["http://a/scenes/alps", "http://a/scenes/moon"].map(|s| Shelf::at(path.clone(), s));
+            ["http://a/scenes/alps", "http://a/scenes/moon"].map(|s| Shelf::at(Some(file.clone()), s));
         assert!(alps.recall().unwrap().is_empty());
         let one = |name: &str| Bookmark { name: name.into(), view: "1,2,3,4,-5".into() };
         let text = |list: &[Bookmark]| serde_json::to_string(list).unwrap();
@@ -82,7 +82,6 @@ mod tests {
         assert_eq!(alps.recall().unwrap(), [one("summit"), one("lake")]);
         assert_eq!(moon.recall().unwrap(), [one("crater")]);
         // What somebody else wrote there is not lost.
-        let file = path.clone().unwrap();
         std::fs::write(&file, "no JSON").unwrap();
         assert!(alps.keep("[]").unwrap_err().to_string().contains("bookmarks.json"));
         assert_eq!(std::fs::read(&file).unwrap(), b"no JSON");
