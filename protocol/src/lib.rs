@@ -11,7 +11,7 @@
 //! | [`tin`] | the irregular triangles of a diamond ⇄ bytes |
 //! | [`rans`] | the entropy coder under both |
 //! | [`index`] | pages of errors, heights and sizes, from which a client knows the cut |
-//! | [`projection`] | longitude and latitude ⇄ the coordinates of a reference system |
+//! | `projection` | longitude and latitude ⇄ the coordinates of a reference system (where the feature of this name is on) |
 //! | [`sight`] | how large an error of heights looks |
 //! | [`message`] | routes, catalogue, batch frames |
 //! | [`zone`] | regions where the viewer stays, and how much of each diamond is seen from there |
@@ -28,6 +28,7 @@ pub mod diamond;
 pub mod index;
 pub mod message;
 pub mod points;
+#[cfg(feature = "projection")]
 pub mod projection;
 pub mod rans;
 pub mod sight;
