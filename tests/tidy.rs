@@ -89,8 +89,8 @@ const CLIENT: &[(&str, &[&str])] = &[
     (
         "viewer",
         &[
-            "camera", "controls", "drawing", "headless", "overview", "pick", "picture", "render", "surface",
-            "terrain",
+            "camera", "controls", "drawing", "encoding", "headless", "overview", "pick", "picture", "render",
+            "surface", "terrain",
         ],
     ),
     ("web", &["encoding", "fetch", "render", "terrain", "viewer"]),

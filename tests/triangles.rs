@@ -227,3 +227,62 @@ fn what_triangles_cannot_do_is_refused_with_the_remedy() {
     let (code, text) = client(&["fly", &scene, "--morph", "1"]);
     assert!(code == Some(2) && text.contains("leave --morph or --encoding tin out"), "{text}");
 }
+
+/// Goes on until the scene is streamed otherwise, and looks at each frame on the way.
+fn go_over(terrain: &mut Terrain, camera: &Camera, error_pixels: f64) {
+    let reloads = terrain.frame(camera).stats.reloads;
+    let until = Instant::now() + MINUTE;
+    loop {
+        let view = terrain.frame(camera);
+        let tins = view.items.iter().filter(|item| item.surface.tin().is_some()).count();
+        assert!(
+            !view.items.is_empty() && (tins == 0 || tins == view.items.len()),
+            "{tins} of {}",
+            view.items.len()
+        );
+        assert!(view.error_pixels <= error_pixels + 1e-6, "{} pixels on the way", view.error_pixels);
+        if view.stats.reloads > reloads {
+            return;
+        }
+        assert!(Instant::now() < until, "{:?}", terrain.problem());
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn one_encoding_gives_way_to_the_other_without_a_gap() {
+    let world = World::whole_with_triangles(257);
+    let mut terrain = open(&world.served.scene("world"), Encoding::Points, 1.0);
+    let camera = any_camera(&terrain, 1.0, 0.5);
+    assert!(terrain.settle(&camera, MINUTE).complete);
+    for encoding in [Encoding::Tin, Encoding::Points] {
+        terrain.choose(encoding, None);
+        assert_eq!(terrain.choice(), (encoding, None));
+        go_over(&mut terrain, &camera, 1.0);
+        let view = terrain.settle(&camera, MINUTE);
+        assert!(view.complete && terrain.encoding() == encoding, "{:?}", terrain.problem());
+        let is_tin = |item: &DrawItem| item.surface.tin().is_some();
+        assert!(view.items.iter().all(|item| is_tin(item) == (encoding == Encoding::Tin)));
+    }
+    // Chosen and taken back before it is there: nothing happens.
+    terrain.choose(Encoding::Tin, None);
+    terrain.choose(Encoding::Points, None);
+    let view = terrain.settle(&camera, MINUTE);
+    assert!(view.complete && view.stats.reloads == 2);
+}
+
+#[test]
+fn an_encoding_that_is_not_offered_changes_nothing() {
+    let world = World::sample(257, 1.0);
+    let mut terrain = open(&world.served.scene("world"), Encoding::Points, 1.0);
+    let camera = any_camera(&terrain, 1.0, 0.5);
+    assert!(terrain.settle(&camera, MINUTE).complete);
+    terrain.choose(Encoding::Tin, None);
+    let until = Instant::now() + MINUTE;
+    while terrain.choice().0 == Encoding::Tin {
+        assert!(!terrain.frame(&camera).items.is_empty() && Instant::now() < until);
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    assert!(terrain.problem().is_some_and(|problem| problem.contains("tin")), "{:?}", terrain.problem());
+    assert!(terrain.settle(&camera, MINUTE).complete);
+}

@@ -103,6 +103,21 @@ fn until(
     }
 }
 
+/// What is on the screen once it shows ground and nothing more is on its way.
+fn steady(screen: &Screen, what: &str) -> (usize, Vec<[u8; 3]>) {
+    let mut before = until(screen, what, |picture| ground(picture) > 0.2);
+    let started = Instant::now();
+    loop {
+        sleep(Duration::from_millis(500));
+        let now = screen.picture();
+        if (ground(&now) - ground(&before)).abs() < 1e-4 {
+            return now;
+        }
+        assert!(started.elapsed() < PATIENCE, "{what}: it does not come to rest");
+        before = now;
+    }
+}
+
 fn view(screen: &Screen, folder: &Path, url: &str) -> Running {
     let mut command = Command::new(&programs().client);
     command.args(["view", url, "--size", "1000x700", "--error-pixels", "4", "--no-antialias"]);
@@ -116,7 +131,7 @@ fn a_window_shows_the_terrain_and_obeys() {
     let served = serve(&[world.folder.path().join("store")]);
     let (screen, folder) = (Screen::start(), tempfile::tempdir().unwrap());
     let mut viewer = view(&screen, folder.path(), &served.address);
-    let first = until(&screen, "terrain appears", |picture| ground(picture) > 0.2);
+    let first = steady(&screen, "terrain appears");
     // A drag moves the ground: to the right, and up.
     let [x, y] = solid(&first);
     let at = |x: usize, y: usize| [x.to_string(), y.to_string()];

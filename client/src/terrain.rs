@@ -228,6 +228,10 @@ pub struct Terrain {
     failed: HashSet<fetch::Key, RandomState>,
     problem: Option<String>,
     scene_changed: bool,
+    /// How the scene is to be streamed from now on, until it is.
+    chosen: Option<Options>,
+    /// Seconds of motions where the encoding has any.
+    morph_seconds: f64,
     /// The version that takes over, once this one has been replaced.
     reload: Option<Reload>,
     /// The declared error of the last frame.
@@ -335,6 +339,7 @@ impl Terrain {
         let cache = Cache::new(forests, options.memory_bytes);
         let scene = Arc::new(scene);
         let shown = options.layers.clone();
+        let morph_seconds = options.morph_seconds;
         let mut terrain = Self {
             url: fetcher.address(),
             layers,
@@ -349,6 +354,8 @@ impl Terrain {
             failed: HashSet::default(),
             problem: None,
             scene_changed: false,
+            chosen: None,
+            morph_seconds,
             reload: None,
             error_pixels: f64::INFINITY,
             traffic_before: Traffic::default(),
@@ -372,6 +379,12 @@ impl Terrain {
     #[must_use]
     pub fn scene_changed(&self) -> bool {
         self.scene_changed
+    }
+
+    /// How diamonds are encoded.
+    #[must_use]
+    pub fn encoding(&self) -> Encoding {
+        self.options.fetch.encoding
     }
 
     /// The zone that was asked for.
@@ -452,7 +465,7 @@ impl Terrain {
     /// As [`Terrain::frame`], at a moment of the caller's clock, which runs forward: seconds from any beginning, the same
     /// for all frames. Only motions depend on it.
     pub fn frame_at(&mut self, camera: &Camera, seconds: f64) -> FrameView {
-        if self.scene_changed
+        if self.is_leaving()
             && let Some(view) = self.go_over(camera, seconds)
         {
             return view;
@@ -467,7 +480,7 @@ impl Terrain {
         self.take_decoded();
         let arrived = self.take_fetched();
         // What comes of another version is still to come.
-        let mut view = FrameView { complete: !self.scene_changed, ..FrameView::default() };
+        let mut view = FrameView { complete: !self.is_leaving(), ..FrameView::default() };
         let mut wishes = Vec::new();
         (self.stats.splits_ideal, self.stats.splits_drawn) = (0, 0);
         // Heights that are multiplied, all of them, leave hidden what is hidden.
@@ -559,7 +572,7 @@ impl Terrain {
             };
             let stuck = match &self.reload {
                 Some(reload) => reload.is_stuck(),
-                None => !self.scene_changed && self.is_stuck(),
+                None => !self.is_leaving() && self.is_stuck(),
             };
             let still = view.moving == 0 || seconds.is_some();
             if (still && (view.complete || stuck)) || Instant::now() >= until {

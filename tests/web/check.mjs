@@ -2,7 +2,7 @@
 // pixels: a page whose device is lost at the first frame goes on counting frames.
 //
 // node check.mjs PLAYWRIGHT CHROMIUM URL CLIENT FOLDER: the folder of playwright-core, the browser, the server of scenes
-// `hills` and `plain`, the client's program, and a folder for pictures.
+// `hills`, `plain` and `lake` (hills and water), the client's program, and a folder for pictures.
 import { execFileSync } from 'node:child_process';
 import { readFileSync, writeFileSync } from 'node:fs';
 import { createRequire } from 'node:module';
@@ -32,11 +32,11 @@ function check(is_so, what) {
 const hash = ({ eye, heading, pitch }) => `#${[...eye, heading, pitch].join(',')}`;
 
 /// The same view by the client without a window.
-function headless(view, path) {
+function headless(scene, view, path) {
     const [heading, pitch] = [view.heading, view.pitch].map((degrees) => degrees * Math.PI / 180);
     const ahead = [Math.sin(heading) * Math.cos(pitch), Math.cos(heading) * Math.cos(pitch), -Math.sin(pitch)];
     const target = view.eye.map((at, i) => at + 1000 * ahead[i]);
-    execFileSync(client, ['render', `${url}/scenes/hills`, '-o', path, '--size', `${SIZE.width}x${SIZE.height}`,
+    execFileSync(client, ['render', `${url}/scenes/${scene}`, '-o', path, '--size', `${SIZE.width}x${SIZE.height}`,
         '--error-pixels', `${ERROR_PIXELS}`, '--eye', view.eye.join(','), '--target', target.join(',')]);
     return readFileSync(path);
 }
@@ -146,13 +146,34 @@ async function heights(page, reference, blank, graphics) {
     return `${mean.toFixed(2)} from the client's picture, longest frame ${last.longest_frame_milliseconds.toFixed(0)} ms`;
 }
 
+/// Water: as the client draws it but for its waves, which move, and not where it is left out.
+async function water(page, blank, graphics) {
+    const query = `scene=lake&error=${ERROR_PIXELS}${graphics === 'webgl' ? '&graphics=webgl' : ''}`;
+    const shot = async (more, name) => {
+        await page.goto('about:blank');
+        await page.goto(`${url}/?${query}${more}${hash(VIEW)}`);
+        await settled(page);
+        await page.keyboard.press('Tab');
+        await frames(page, 3);
+        return page.screenshot({ path: join(folder, `${graphics}-${name}.png`) });
+    };
+    const dry = await shot('&layer=terrain', 'dry');
+    const wet = await shot('', 'lake');
+    const [beside, without] = [await compare(blank, [wet, lake]), await compare(blank, [wet, dry])];
+    check(beside.mean < 6 && beside.off < 0.1, `water differs from the client's: ${JSON.stringify(beside)}`);
+    check(without.off > 0.05, `water is hardly seen: ${JSON.stringify(without)}`);
+    await frames(page, 20);
+    check((await compare(blank, [wet, await page.screenshot()])).mean > 0.02, 'the waves stand still');
+    return `water ${beside.mean.toFixed(2)}`;
+}
+
 /// A page that says what to choose from, if it is not told.
 async function choice(page) {
     await page.goto(`${url}/`);
     const links = page.locator('#message a');
     await links.first().waitFor({ timeout: PATIENCE });
     const names = await links.allTextContents();
-    check(names.join() === 'hills,plain', `to choose from: ${names}`);
+    check(names.toSorted().join() === 'hills,lake,plain', `to choose from: ${names}`);
     await links.first().click();
     await page.waitForFunction(() => window.diamantina?.state().frames > 0, null, { timeout: PATIENCE });
     check((await state(page)).scene === 'hills', 'another scene was chosen');
@@ -160,7 +181,8 @@ async function choice(page) {
     await page.locator('#message.failed').waitFor({ timeout: PATIENCE });
 }
 
-const reference = headless(VIEW, join(folder, 'client.png'));
+const reference = headless('hills', VIEW, join(folder, 'client.png'));
+const lake = headless('lake', VIEW, join(folder, 'client-lake.png'));
 for (const graphics of ['webgpu', 'webgl']) {
     const began = Date.now();
     const args = [...COMMON, ...FLAGS[graphics]];
@@ -173,7 +195,11 @@ for (const graphics of ['webgpu', 'webgl']) {
         page.on('console', (line) => line.type() === 'error' && !allowed?.test(line.text()) && wrong.push(line.text()));
         page.on('pageerror', (error) => wrong.push(`${error}`));
         page.on('response', (answer) => answer.status() >= 400 && !allowed && wrong.push(`${answer.status()} ${answer.url()}`));
-        const what = await heights(page, reference, blank, graphics).catch(async (error) => {
+        const look = async () => [
+            await heights(page, reference, blank, graphics),
+            await water(page, blank, graphics),
+        ].join(', ');
+        const what = await look().catch(async (error) => {
             await page.screenshot({ path: join(folder, `${graphics}-failed.png`) }).catch(() => {});
             throw new Error(`${graphics}: ${error.message}; errors: ${wrong.join(' | ') || 'none'}`);
         });

@@ -2,11 +2,12 @@
 //!
 //! What is here stays on the screen. Meanwhile the scene is opened again, in the background, and what the view needs of it is
 //! loaded, beside what is drawn; once it is as exact, it takes over, in one frame. While both are there, they take
-//! twice the memory.
+//! twice the memory. The same way another encoding of the same version is gone over to, or another zone.
 
 use super::{FrameView, Options, Terrain, TerrainError};
 use crate::background::aside;
 use crate::camera::Camera;
+use crate::encoding::Encoding;
 use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
 use std::time::Duration;
 use web_time::Instant;
@@ -52,15 +53,47 @@ impl Reload {
 }
 
 impl Terrain {
+    /// Streams the scene in an encoding, and for a zone or none, from one of the next frames on: what is drawn stays until
+    /// the other is as exact. [`Terrain::problem`] says so if that cannot be had; then it goes on as before.
+    pub fn choose(&mut self, encoding: Encoding, zone: Option<String>) {
+        self.reload = None;
+        let is_so = encoding == self.encoding() && zone == self.options.zone;
+        // Triangles do not move.
+        let morph_seconds = if encoding == Encoding::Points { self.morph_seconds } else { 0.0 };
+        let mut options = Options { zone, morph_seconds, ..self.options.clone() };
+        options.fetch.encoding = encoding;
+        self.chosen = (!is_so).then_some(options);
+    }
+
+    /// The encoding and the zone that were chosen: what is streamed, or will be.
+    #[must_use]
+    pub fn choice(&self) -> (Encoding, Option<&str>) {
+        let options = self.next_options();
+        (options.fetch.encoding, options.zone.as_deref())
+    }
+
+    fn next_options(&self) -> &Options {
+        self.chosen.as_ref().unwrap_or(&self.options)
+    }
+
+    /// Whether another takes over as soon as it is ready.
+    pub(super) fn is_leaving(&self) -> bool {
+        self.scene_changed || self.chosen.is_some()
+    }
+
     /// A frame of the version that took this one's place, if it is ready, or else `None`. It takes over then.
     pub(super) fn go_over(&mut self, camera: &Camera, seconds: f64) -> Option<FrameView> {
         let mut reload = match self.reload.take() {
-            None => open(&self.url, &self.options),
-            Some(Reload::Failed(until)) if Instant::now() >= until => open(&self.url, &self.options),
+            None => open(&self.url, self.next_options()),
+            Some(Reload::Failed(until)) if Instant::now() >= until => open(&self.url, self.next_options()),
             Some(Reload::Opening(receiver)) => match receiver.try_recv() {
                 Ok(Ok(next)) => Reload::Loading(Box::new(next)),
                 Ok(Err(error)) => {
                     self.problem = Some(error.to_string());
+                    // What was chosen is not there.
+                    if self.chosen.take().is_some() && !self.scene_changed {
+                        return None;
+                    }
                     Reload::Failed(Instant::now() + PAUSE)
                 }
                 Err(TryRecvError::Empty) => Reload::Opening(receiver),
@@ -100,6 +133,7 @@ impl Terrain {
     /// Goes on as another version. What was counted counts on.
     fn become_next(&mut self, mut next: Self) {
         next.opened = self.opened;
+        next.morph_seconds = self.morph_seconds;
         next.traffic_before = self.traffic_before.plus(&self.fetcher.traffic());
         next.stats.reloads = self.stats.reloads + 1;
         next.stats.first_picture_seconds = self.stats.first_picture_seconds;

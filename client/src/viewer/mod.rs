@@ -236,10 +236,14 @@ impl Viewer {
         if let Some(ground) = ground {
             self.controls.stay_above(ground, CLEARANCE_CELLS * self.cell());
         }
-        let reloads = self.frame.stats.reloads;
+        let (reloads, is_replaced) = (self.frame.stats.reloads, self.terrain.scene_changed());
         self.frame = self.terrain.frame(self.controls.camera());
         if self.frame.stats.reloads != reloads {
-            self.go_over();
+            // Of whatever encoding, its surfaces are the frame's before.
+            self.frozen = None;
+            if is_replaced {
+                self.go_over();
+            }
         }
         measure::follow(self);
         if self.shows_boxes {
@@ -257,7 +261,6 @@ impl Viewer {
 
     /// Forgets what was of the version of the scene before: layers may be others now, and lie elsewhere.
     fn go_over(&mut self) {
-        self.frozen = None;
         self.marks.clear();
         self.profile = Profile::default();
         self.globe = Globe::of(&self.terrain.scene().frame);

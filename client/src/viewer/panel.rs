@@ -1,6 +1,7 @@
 //! The panel: what can be chosen, figures, and what was clicked.
 
 use super::{Ask, Viewer, bookmarks, measure};
+use crate::encoding::Encoding;
 use crate::render::{Background, Colours};
 use crate::terrain::FrameView;
 use diamantina_protocol::message::Kind;
@@ -114,6 +115,7 @@ fn view(viewer: &mut Viewer, ui: &mut Ui) {
     if ui.add(Slider::new(&mut exaggeration, 0.1..=20.0).logarithmic(true).text("exaggeration")).changed() {
         viewer.set_exaggeration(exaggeration);
     }
+    streaming(viewer, ui);
     let name = |colours: Colours| match colours {
         Colours::Auto => "as the heights suggest",
         Colours::Terrain => "terrain",
@@ -132,6 +134,42 @@ fn view(viewer: &mut Viewer, ui: &mut Ui) {
     let mut is_frozen = viewer.frozen.is_some();
     if ui.checkbox(&mut is_frozen, "freeze what is drawn").changed() {
         viewer.frozen = is_frozen.then(|| viewer.frame.items.clone());
+    }
+}
+
+/// How the scene is streamed, where there is a choice.
+fn streaming(viewer: &mut Viewer, ui: &mut Ui) {
+    let scene = viewer.terrain.scene();
+    let is_offered = |encoding: &Encoding| {
+        scene.layers.iter().all(|layer| layer.encodings.iter().any(|name| name == encoding.name()))
+    };
+    let encodings: Vec<Encoding> = [Encoding::Points, Encoding::Tin].into_iter().filter(is_offered).collect();
+    let zones: Vec<String> = scene.zones.iter().map(|zone| zone.name.clone()).collect();
+    let (encoding, zone) = viewer.terrain.choice();
+    let (mut encoding, mut zone) = (encoding, zone.map(str::to_owned));
+    let before = (encoding, zone.clone());
+    if encodings.len() > 1 {
+        let name = |encoding| match encoding {
+            Encoding::Points => "points: fewest bytes",
+            Encoding::Tin => "tin: fewest triangles",
+        };
+        ComboBox::from_label("encoding").selected_text(name(encoding)).show_ui(ui, |ui| {
+            for one in encodings {
+                ui.selectable_value(&mut encoding, one, name(one));
+            }
+        });
+    }
+    if !zones.is_empty() {
+        let text = zone.clone().unwrap_or_else(|| "none".to_owned());
+        ComboBox::from_label("zone").selected_text(text).show_ui(ui, |ui| {
+            ui.selectable_value(&mut zone, None, "none");
+            for one in zones {
+                ui.selectable_value(&mut zone, Some(one.clone()), one);
+            }
+        });
+    }
+    if (encoding, zone.clone()) != before {
+        viewer.terrain.choose(encoding, zone);
     }
 }
 
