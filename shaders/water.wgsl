@@ -94,7 +94,7 @@ fn water_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
     let other = scene_distance(bed.xy, dot(other_ray, frame.forward.xyz));
     // What stands before the surface is not seen through it.
     let other_depth = p.z - other_ray.z * other;
-    if !from_below && bed.z > 0.0 && outside(bed.xy) == 0.0 && other_depth > 0.0 {
+    if !from_below && bed.z > 0.0 && outside(bed.xy) == 0.0 && other_depth > 0.0 && other > distance {
         place = bed.xy;
         depth = other_depth;
     }
