@@ -190,7 +190,8 @@ pub struct Renderer {
     /// Of the uniforms of a pass, and of a layer.
     groups: [wgpu::BindGroupLayout; 2],
     sky: wgpu::RenderPipeline,
-    lens: Lens,
+    /// There but while a frame is drawn.
+    lens: Option<Lens>,
     water: Option<WaterPasses>,
     attachments: Option<Attachments>,
 }
@@ -241,7 +242,7 @@ impl Renderer {
             filled: terrain_pipelines(&device, target, &groups.each_ref(), Mode::Filled),
             wires: None,
             sky: sky_pipeline(&device, target, &groups[0]),
-            lens: Lens::new(&device, &groups),
+            lens: None,
             groups,
             water: None,
             attachments: None,
@@ -287,11 +288,11 @@ impl Renderer {
             _ => Attachments::new(&self.device, &self.options, camera.size),
         };
         let view = View::straight(camera);
-        let mut draws = self.in_view(layers, &view, items, look, |item| !self.is_water(layers, item, look));
+        let mut draws = self.in_view(layers, &view, items, look, |item| !is_water(layers, item, look));
         let land_count = draws.len();
-        draws.extend(self.in_view(layers, &view, items, look, |item| self.is_water(layers, item, look)));
+        draws.extend(self.in_view(layers, &view, items, look, |item| is_water(layers, item, look)));
         let (land, surfaces) = draws.split_at(land_count);
-        let mut lens = std::mem::replace(&mut self.lens, Lens::new(&self.device, &self.groups));
+        let mut lens = self.lens.take().unwrap_or_else(|| Lens::new(&self.device, &self.groups));
         lens.write(self, layers, &view, look, &draws, !self.options.format.is_srgb());
         let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         let mut water = self.water.take();
@@ -323,20 +324,13 @@ impl Renderer {
             }
             lens.draw_sky(&mut pass, &self.sky, look);
         }
-        (self.lens, self.water, self.attachments) = (lens, water, Some(attachments));
+        (self.lens, self.water, self.attachments) = (Some(lens), water, Some(attachments));
         self.queue.submit([encoder.finish()]);
         stats
     }
 
     fn target(&self) -> Target {
         Target { format: self.options.format, samples: self.options.samples }
-    }
-
-    /// Whether an item is drawn as water, by passes of its own.
-    #[allow(clippy::unused_self, reason = "asked of the renderer by its parts")]
-    fn is_water(&self, layers: &[Layer], item: &DrawItem, look: &Look) -> bool {
-        let is_water = layers.get(item.layer).is_some_and(|layer| layer.kind == message::Kind::Water);
-        is_water && look.water.reflecting && !look.wireframe
     }
 
     /// Those items that a view may see, in an order that switches index buffers seldom and draws what
@@ -437,6 +431,12 @@ impl Renderer {
             }
         }
     }
+}
+
+/// Whether an item is drawn as water, by passes of its own.
+fn is_water(layers: &[Layer], item: &DrawItem, look: &Look) -> bool {
+    let is_water = layers.get(item.layer).is_some_and(|layer| layer.kind == message::Kind::Water);
+    is_water && look.water.reflecting && !look.wireframe
 }
 
 impl Lens {

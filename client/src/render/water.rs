@@ -12,7 +12,7 @@
 use super::frame::single;
 use super::pipelines::{Mode, Pipelines, Target, sky_pipeline, terrain_pipelines};
 use super::view::View;
-use super::{DEPTH, Draw, FrameStats, Lens, Look, Renderer, clear_colour};
+use super::{DEPTH, Draw, FrameStats, Lens, Look, Renderer, clear_colour, is_water};
 use crate::camera::Camera;
 use crate::drawing::DrawItem;
 use diamantina_protocol::message::Layer;
@@ -214,7 +214,7 @@ impl WaterPasses {
             self.scene = Sheet::new(device, "seen through water", camera.size);
             self.mirrors.clear();
         }
-        let is_land = |item: &DrawItem| !renderer.is_water(layers, item, look);
+        let is_land = |item: &DrawItem| !is_water(layers, item, look);
         // Haze lies before the surface, not before the bed: the surface's own pixels add it.
         let clear = Look { haze: 0.0, ..*look };
         let view = View::straight(camera);

@@ -9,14 +9,7 @@ fn light(byte: u8) -> f64 {
     if c <= 0.040_45 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
 }
 
-const CALM: Water = Water {
-    reflecting: true,
-    refractive_index: 1.33,
-    waves: 0.0,
-    seconds: 0.0,
-    clarity: None,
-    mirror_scale: 1.0,
-};
+const CALM: Water = PLAIN.water;
 
 /// Land and water over the same forest; water level at a height in metres.
 struct Shore {
