@@ -10,6 +10,7 @@
 
 use crate::bintree::{Forest, Point};
 use crate::points::Coding;
+use crate::texture::{Texture, Tile};
 use crate::wire::{self, WireError};
 use crate::zone::Zone;
 use serde::{Deserialize, Serialize};
@@ -45,6 +46,9 @@ pub struct Scene {
     /// The regions with a visibility mask.
     #[serde(default)]
     pub zones: Vec<Zone>,
+    /// Imagery draped on the terrain. No name of these is a layer's.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub textures: Vec<Texture>,
 }
 
 /// The planar coordinate system of a scene. Coordinates are metres, x east, y north, heights up.
@@ -218,6 +222,13 @@ pub fn index_route(scene: &str, version: &str, layer: &str, page: u32) -> String
 #[must_use]
 pub fn zone_route(scene: &str, version: &str, zone: &str) -> String {
     format!("/scenes/{scene}/{version}/zones/{zone}")
+}
+
+/// The path of a tile of a texture.
+#[must_use]
+pub fn tile_route(scene: &str, version: &str, texture: &str, tile: Tile) -> String {
+    let Tile { level, x, y } = tile;
+    format!("/scenes/{scene}/{version}/{texture}/texture/{level}/{x}/{y}")
 }
 
 /// The path of one diamond.

@@ -1,5 +1,6 @@
 //! What a store holds: levels, bytes, errors; and, on request, whether every blob is intact.
 
+mod texture;
 mod tin;
 
 pub use tin::{TinInspection, TinLevel};
@@ -123,6 +124,14 @@ pub enum InspectError {
         /// What is wrong.
         what: String,
     },
+    /// The tiles of a texture are missing or wrong.
+    #[error("texture '{texture}': {what}; build the store again")]
+    Texture {
+        /// The texture.
+        texture: String,
+        /// What is wrong.
+        what: String,
+    },
     /// Something is in the store that nobody asks for.
     #[error("layer {layer}: {count} blobs belong to no diamond; build the store again")]
     Strays {
@@ -240,6 +249,9 @@ pub fn inspect(store: &Store, verify: bool) -> Result<Inspection, InspectError> 
             layer.tin.as_ref().map(|tin| tin::inspect(store, number, layer, tin, verify)).transpose()?;
         layers.push(LayerInspection { tin: triangles, ..summary(layer, &entries, index_bytes, tally) });
     }
+    for (number, texture) in (0u8..).zip(&store.scene().textures) {
+        texture::inspect(store, number, texture, verify)?;
+    }
     for position in 0..if verify { store.scene().zones.len() } else { 0 } {
         masks(store, position)?;
     }
@@ -268,7 +280,7 @@ fn sizes(
                     None => strays += 1,
                 }
             }
-            Kind::Zone | Kind::Tin | Kind::TinIndex => {}
+            Kind::Zone | Kind::Tin | Kind::TinIndex | Kind::Texture | Kind::TextureIndex => {}
         }
     }
     if strays > 0 {

@@ -2,7 +2,8 @@
 
 use diamantina_protocol::message::Kind;
 use diamantina_server::hierarchy::LayerSource;
-use diamantina_server::ingest::{self, Grid, IngestError, Source};
+use diamantina_server::ingest::{self, Grid, Imagery, IngestError, Source};
+use diamantina_server::texture::TextureSource;
 use std::path::PathBuf;
 use std::str::FromStr;
 
@@ -16,13 +17,29 @@ const NAME_LENGTH_MAX: usize = 64;
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct LayerArg {
     name: String,
-    kind: Kind,
-    heights: Heights,
+    what: What,
+    data: Data,
 }
 
-/// Where the heights of a layer are from.
+/// What a layer is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum What {
+    Surface(Kind),
+    Texture,
+}
+
+impl What {
+    fn word(self) -> &'static str {
+        match self {
+            Self::Surface(kind) => word(kind),
+            Self::Texture => "texture",
+        }
+    }
+}
+
+/// What a layer is made of.
 #[derive(Debug, Clone, PartialEq)]
-enum Heights {
+enum Data {
     Files(Vec<PathBuf>),
     /// Metres, the same everywhere.
     Level(f64),
@@ -45,38 +62,36 @@ impl FromStr for LayerArg {
             )
         };
         let (name, rest) = text.split_once('=').ok_or_else(form)?;
-        let (kind, heights) = rest.split_once(':').ok_or_else(form)?;
+        let (kind, data) = rest.split_once(':').ok_or_else(form)?;
         if !is_layer_name(name) {
             return Err(format!(
                 "expected a name of 1 to {NAME_LENGTH_MAX} small letters, digits, '-' or '_' other than 'zones', which \
                  addresses have a place for, found '{name}'"
             ));
         }
-        let kind = match kind {
-            "terrain" => Kind::Terrain,
-            "water" => Kind::Water,
-            "texture" => {
-                return Err("textures are not built yet: expected the kind terrain or water".to_owned());
-            }
-            other => return Err(format!("expected the kind terrain or water, found '{other}'")),
+        let what = match kind {
+            "terrain" => What::Surface(Kind::Terrain),
+            "water" => What::Surface(Kind::Water),
+            "texture" => What::Texture,
+            other => return Err(format!("expected the kind terrain, water or texture, found '{other}'")),
         };
-        let heights = match heights.strip_prefix("level=") {
-            Some(_) if kind == Kind::Terrain => {
+        let data = match data.strip_prefix("level=") {
+            Some(_) if what != What::Surface(Kind::Water) => {
                 return Err(
-                    "level= is for water: ground comes from a file (one of that name is ./level=...)"
+                    "level= is for water: all else comes from a file (one of that name is ./level=...)"
                         .to_owned(),
                 );
             }
             Some(metres) => {
                 let level = metres.parse().ok().filter(|level: &f64| level.is_finite());
-                Heights::Level(
+                Data::Level(
                     level.ok_or_else(|| format!("expected level=METRES, a number, found '{metres}'"))?,
                 )
             }
-            None if heights.is_empty() => return Err(form()),
-            None => Heights::Files(vec![heights.into()]),
+            None if data.is_empty() => return Err(form()),
+            None => Data::Files(vec![data.into()]),
         };
-        Ok(Self { name: name.to_owned(), kind, heights })
+        Ok(Self { name: name.to_owned(), what, data })
     }
 }
 
@@ -88,26 +103,26 @@ impl FromStr for LayerArg {
 pub(super) fn join(files: &[PathBuf], named: &[LayerArg]) -> Result<Vec<LayerArg>, String> {
     let mut layers: Vec<LayerArg> = Vec::new();
     if !files.is_empty() {
-        let heights = Heights::Files(files.to_vec());
-        layers.push(LayerArg { name: TERRAIN.to_owned(), kind: Kind::Terrain, heights });
+        let data = Data::Files(files.to_vec());
+        layers.push(LayerArg { name: TERRAIN.to_owned(), what: What::Surface(Kind::Terrain), data });
     }
     for more in named {
         let Some(layer) = layers.iter_mut().find(|layer| layer.name == more.name) else {
             layers.push(more.clone());
             continue;
         };
-        if layer.kind != more.kind {
+        if layer.what != more.what {
             let whence =
                 if files.is_empty() || more.name != TERRAIN { "" } else { " (as files without --layer are)" };
             return Err(format!(
                 "--layer: '{}' is {}{whence} and {}: give one of both another name",
                 more.name,
-                word(layer.kind),
-                word(more.kind)
+                layer.what.word(),
+                more.what.word()
             ));
         }
-        match (&mut layer.heights, &more.heights) {
-            (Heights::Files(all), Heights::Files(files)) => all.extend_from_slice(files),
+        match (&mut layer.data, &more.data) {
+            (Data::Files(all), Data::Files(files)) => all.extend_from_slice(files),
             _ => {
                 return Err(format!(
                     "--layer: '{}' has a level and something else besides: give one of both another name",
@@ -116,8 +131,12 @@ pub(super) fn join(files: &[PathBuf], named: &[LayerArg]) -> Result<Vec<LayerArg
             }
         }
     }
-    if !layers.iter().any(|layer| layer.kind == Kind::Terrain) {
-        return Err("expected terrain, found water alone: name a DEM of the ground, too".to_owned());
+    if !layers.iter().any(|layer| layer.what == What::Surface(Kind::Terrain)) {
+        let found: Vec<&str> = layers.iter().map(|layer| layer.what.word()).collect();
+        return Err(format!(
+            "expected terrain, found {} alone: name a DEM of the ground, too",
+            found.join(", ")
+        ));
     }
     Ok(layers)
 }
@@ -129,9 +148,10 @@ pub(super) fn word(kind: Kind) -> &'static str {
     }
 }
 
-/// The opened sources of layers.
+/// The opened sources of layers, and pictures of textures.
 pub(super) struct Layers {
-    opened: Vec<(LayerArg, Source)>,
+    opened: Vec<(LayerArg, Kind, Source)>,
+    textures: Vec<(LayerArg, Imagery)>,
 }
 
 impl Layers {
@@ -145,9 +165,11 @@ impl Layers {
         options: &ingest::Options,
         cells_log2: u8,
     ) -> Result<Self, IngestError> {
-        let mut sources: Vec<Option<Source>> = Vec::with_capacity(layers.len());
-        for layer in &layers {
-            let Heights::Files(files) = &layer.heights else {
+        let (surfaces, pictures): (Vec<_>, Vec<_>) =
+            layers.into_iter().partition(|layer| layer.what != What::Texture);
+        let mut sources: Vec<Option<Source>> = Vec::with_capacity(surfaces.len());
+        for layer in &surfaces {
+            let Data::Files(files) = &layer.data else {
                 sources.push(None);
                 continue;
             };
@@ -157,36 +179,55 @@ impl Layers {
                 Some(first) => ingest::open_over(files, options, first)?,
             }));
         }
-        let ground = layers.iter().position(|layer| layer.kind == Kind::Terrain);
-        for (number, layer) in layers.iter().enumerate() {
+        let ground = surfaces.iter().position(|layer| layer.what == What::Surface(Kind::Terrain));
+        for (number, layer) in surfaces.iter().enumerate() {
             let ground = ground.and_then(|number| sources[number].as_ref());
-            let (Heights::Level(metres), Some(ground)) = (&layer.heights, ground) else { continue };
+            let (Data::Level(metres), Some(ground)) = (&layer.data, ground) else { continue };
             let level = ingest::level(*metres, cells_log2, ground)?;
             sources[number] = Some(level);
         }
-        let opened = layers.into_iter().zip(sources).filter_map(|(layer, source)| Some((layer, source?)));
-        Ok(Self { opened: opened.collect() })
+        let mut textures = Vec::with_capacity(pictures.len());
+        let first = sources.iter().flatten().next();
+        for (texture, first) in pictures.into_iter().zip(std::iter::repeat(first)) {
+            if let (Data::Files(files), Some(first)) = (&texture.data, first) {
+                let imagery = Imagery::open(files, options, first)?;
+                textures.push((texture, imagery));
+            }
+        }
+        let opened = surfaces.into_iter().zip(sources).filter_map(|(layer, source)| {
+            let What::Surface(kind) = layer.what else { return None };
+            Some((layer, kind, source?))
+        });
+        Ok(Self { opened: opened.collect(), textures })
     }
 
     /// What is to be built.
     pub(super) fn sources(&self) -> Vec<LayerSource<'_>> {
         let each = self.opened.iter();
-        each.map(|(layer, source)| LayerSource { name: &layer.name, kind: layer.kind, source }).collect()
+        each.map(|(layer, kind, source)| LayerSource { name: &layer.name, kind: *kind, source }).collect()
+    }
+
+    /// What is to be draped on it.
+    pub(super) fn textures(&self) -> Vec<TextureSource<'_>> {
+        let each = self.textures.iter();
+        each.map(|(texture, imagery)| TextureSource { name: &texture.name, imagery }).collect()
     }
 
     /// The files of a layer; of the only one, if none is named.
     pub(super) fn files(&self, layer: Option<&str>) -> &[PathBuf] {
-        let found = self.opened.iter().find(|(of, _)| layer.is_none_or(|name| of.name == name));
-        match found.map(|(of, _)| &of.heights) {
-            Some(Heights::Files(files)) => files,
+        let found = self.opened.iter().find(|(of, ..)| layer.is_none_or(|name| of.name == name));
+        match found.map(|(of, ..)| &of.data) {
+            Some(Data::Files(files)) => files,
             _ => &[],
         }
     }
 
-    /// Layers that do not touch the first one: they are shown far from it, which is seldom meant.
+    /// Layers and textures that do not touch the first layer: they are shown far from it, which is seldom meant.
     pub(super) fn apart(&self) -> Vec<&str> {
-        let Some((_, first)) = self.opened.first() else { return Vec::new() };
-        let far = self.opened.iter().filter(|(_, source)| !touch(first.grid(), source.grid()));
+        let Some((_, _, first)) = self.opened.first() else { return Vec::new() };
+        let surfaces = self.opened.iter().map(|(layer, _, source)| (layer, source.grid()));
+        let textures = self.textures.iter().map(|(texture, imagery)| (texture, imagery.grid()));
+        let far = surfaces.chain(textures).filter(|(_, grid)| !touch(first.grid(), grid));
         far.map(|(layer, _)| layer.name.as_str()).collect()
     }
 }
@@ -213,11 +254,16 @@ mod tests {
 
     #[test]
     fn a_layer_is_a_name_a_kind_and_a_file_or_a_level() {
-        let files = |names: &[&str]| Heights::Files(names.iter().map(PathBuf::from).collect());
-        let sea = LayerArg { name: "sea".to_owned(), kind: Kind::Water, heights: files(&["a=b:c.tif"]) };
+        let files = |names: &[&str]| Data::Files(names.iter().map(PathBuf::from).collect());
+        let sea = LayerArg {
+            name: "sea".to_owned(),
+            what: What::Surface(Kind::Water),
+            data: files(&["a=b:c.tif"]),
+        };
         assert_eq!(arg("sea=water:a=b:c.tif"), sea);
-        assert_eq!(arg("lake_2-b=water:level=-1.5").heights, Heights::Level(-1.5));
-        assert_eq!(arg("lake=water:./level=3").heights, files(&["./level=3"]));
+        assert_eq!(arg("photo=texture:p.jpg").what, What::Texture);
+        assert_eq!(arg("lake_2-b=water:level=-1.5").data, Data::Level(-1.5));
+        assert_eq!(arg("lake=water:./level=3").data, files(&["./level=3"]));
         for (wrong, word) in [
             ("sea", "NAME=KIND:PATH"),
             ("sea=water", "NAME=KIND:PATH"),
@@ -226,8 +272,8 @@ mod tests {
             ("Sea=water:a.tif", "1 to 64 small letters"),
             ("zones=water:a.tif", "'zones'"),
             (&format!("{}=water:a.tif", "a".repeat(65)), "1 to 64 small letters"),
-            ("sea=lava:a.tif", "terrain or water, found 'lava'"),
-            ("sea=texture:a.tif", "not built yet"),
+            ("sea=lava:a.tif", "terrain, water or texture, found 'lava'"),
+            ("photo=texture:level=2", "level= is for water"),
             ("sea=water:level=high", "level=METRES"),
             ("sea=water:level=inf", "level=METRES"),
             ("rock=terrain:level=3", "level= is for water"),
@@ -247,7 +293,7 @@ mod tests {
         let names: Vec<_> = layers.iter().map(|layer| layer.name.as_str()).collect();
         assert_eq!(names, ["terrain", "sea"]);
         for (layer, expected) in layers.iter().zip([["a.tif", "b.tif"], ["s.tif", "t.tif"]]) {
-            assert_eq!(layer.heights, Heights::Files(expected.map(PathBuf::from).to_vec()));
+            assert_eq!(layer.data, Data::Files(expected.map(PathBuf::from).to_vec()));
         }
         assert_eq!(joined(&[], &["ground=terrain:a.tif"]).unwrap().len(), 1);
         for (files, named, word) in [
@@ -255,7 +301,12 @@ mod tests {
             (&some, &["sea=water:a.tif", "sea=terrain:b.tif"], "'sea' is water and terrain"),
             (&some, &["sea=water:a.tif", "sea=water:level=0"], "a level and something else"),
             (&some, &["sea=water:level=1", "sea=water:level=0"], "a level and something else"),
-            (&[], &["sea=water:a.tif"], "found water alone"),
+            (&[], &["sea=water:a.tif", "photo=texture:p.png"], "found water, texture alone"),
+            (
+                &some,
+                &["terrain=texture:p.png"],
+                "'terrain' is terrain (as files without --layer are) and texture",
+            ),
         ] {
             let error = joined(files, named).unwrap_err();
             assert!(error.contains(word), "{named:?}: {error}");

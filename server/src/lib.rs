@@ -19,5 +19,6 @@ pub mod settings;
 pub mod size;
 pub mod store;
 pub mod stream;
+pub mod texture;
 pub mod tin;
 pub mod zone;

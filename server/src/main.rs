@@ -17,7 +17,7 @@ use diamantina_server::store::{Disk, Published, Publisher, Shared, Store, StoreE
 use diamantina_server::tin::Metric;
 use diamantina_server::zone::polygon::Coordinates;
 use diamantina_server::zone::{self, ZoneError};
-use diamantina_server::{curve, demo, experiment, http, ingest};
+use diamantina_server::{curve, demo, experiment, http, ingest, texture};
 use layer_args::{LayerArg, Layers};
 use std::io::{IsTerminal, Write};
 use std::net::SocketAddr;
@@ -69,9 +69,10 @@ struct BuildArgs {
     #[arg(required_unless_present = "layers", value_name = "DEM")]
     sources: Vec<PathBuf>,
     /// Another layer: NAME=terrain:DEM or NAME=water:DEM (there is water where the file has heights), or flat water over
-    /// the first terrain: NAME=water:level=METRES. Said again with the same name it adds a file. The first layer decides
+    /// the first terrain: NAME=water:level=METRES; or imagery draped on the terrain, NAME=texture:PICTURE, as GeoTIFF, PNG
+    /// or JPEG with a world file. Said again with the same name it adds a file. The first layer decides
     /// the frame, to which others are resampled; what is said of files holds for those of all layers
-    #[arg(long = "layer", id = "layers", value_name = "NAME=KIND:DEM")]
+    #[arg(long = "layer", id = "layers", value_name = "NAME=KIND:FILE")]
     layers: Vec<LayerArg>,
     /// The folder of the store, or the address of an object store (s3://BUCKET/PREFIX, gs://..., az://...); an older
     /// scene there is replaced once the new one is complete
@@ -112,6 +113,9 @@ struct BuildArgs {
     /// Metres of the unit in which heights are stored [default: the source's own unit, or found from it]
     #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
     quantum: Option<f64>,
+    /// How well textures keep their pictures: 1 to 99, as of JPEG; 100: exactly
+    #[arg(long, default_value_t = texture::QUALITY, value_name = "N")]
+    texture_quality: u8,
     /// Segments along each side of a patch
     #[arg(long, default_value = "64", value_name = "N", value_parser = ["32", "64", "128"])]
     patch_segments: String,
@@ -431,6 +435,7 @@ fn build(args: &BuildArgs) -> Result<(), Failure> {
             RuleName::Smooth => Rule::Smooth,
         },
         quantum: args.quantum,
+        texture_quality: args.texture_quality,
         patch_log2: match args.patch_segments.as_str() {
             "32" => 5,
             "128" => 7,
@@ -478,7 +483,7 @@ fn build(args: &BuildArgs) -> Result<(), Failure> {
         .unwrap_or_default();
     let progress = Arc::new(Progress::new());
     stop_on_signals(&progress)?;
-    let report = hierarchy::build_layers(&layers.sources(), built, &options, &progress)
+    let report = hierarchy::build_scene(&layers.sources(), &layers.textures(), built, &options, &progress)
         .map_err(|e| refuse_build(Some(&layers), &e))?;
     if let Some(upload) = &upload {
         send(&upload.publisher, built, &args.output, false, &progress)?;
@@ -608,6 +613,8 @@ fn refuse_build(layers: Option<&Layers>, error: &BuildError) -> Failure {
             | BuildError::PatchErrorMemory { .. }
             | BuildError::TinOption { .. }
             | BuildError::Layers(_)
+            | BuildError::Textures(_)
+            | BuildError::TextureQuality(_)
             | BuildError::Store(StoreError::Foreign { .. })
             | BuildError::Ingest(IngestError::Options { .. })
     );

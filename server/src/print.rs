@@ -2,6 +2,7 @@
 
 use crate::layer_args::word;
 use diamantina_protocol::message::Layer;
+use diamantina_protocol::texture::Texture;
 use diamantina_server::experiment;
 use diamantina_server::hierarchy::{Estimate, Estimates, LayerReport, Report};
 use diamantina_server::inspect::{Inspection, TinInspection};
@@ -58,8 +59,28 @@ pub(super) fn report(out: &mut impl Write, store: &Path, report: &Report) -> std
         }
         built(out, layer, found)?;
     }
+    for texture in &report.scene.textures {
+        self::texture(out, texture)?;
+    }
     writeln!(out, "  {:.1} s, {:.2} Msamples/s", report.seconds, report.msamples_per_second)?;
     writeln!(out, "Next: diamantina-server serve {}", store.display())
+}
+
+fn texture(out: &mut impl Write, texture: &Texture) -> std::io::Result<()> {
+    writeln!(
+        out,
+        "texture {}: {} x {} texels of {:.3} x {:.3} m in {} levels, {} tiles of {} bytes, quality {}{}",
+        texture.name,
+        texture.size[0],
+        texture.size[1],
+        texture.texel[0],
+        texture.texel[1],
+        texture.levels(),
+        texture.tiles,
+        texture.bytes,
+        texture.quality,
+        if texture.resampled { ", resampled to the frame" } else { "" }
+    )
 }
 
 fn built(out: &mut impl Write, layer: &Layer, report: &LayerReport) -> std::io::Result<()> {
@@ -135,6 +156,9 @@ pub(super) fn inspection(out: &mut impl Write, i: &Inspection) -> std::io::Resul
         if let (Some(real), Some(fictitious)) = (layer.real_points, layer.fictitious_points) {
             writeln!(out, "  {real} real points, {fictitious} fictitious")?;
         }
+    }
+    for texture in &i.scene.textures {
+        self::texture(out, texture)?;
     }
     for zone in &i.scene.zones {
         let ceilings: Vec<String> = zone.parts.iter().map(|part| format!("{:.3}", part.ceiling)).collect();

@@ -51,6 +51,7 @@ pub use read::{Store, number};
 pub use remote::{Counts, Shared};
 pub use write::{Spot, Writer};
 
+use diamantina_protocol::texture::Tile;
 use error::io_at;
 use format::{BLOB_BYTES_MAX, Manifest, Place, SCENE_BYTES_MAX, SCENE_FILE, is_version, pack_name};
 use objects::folder;
@@ -70,6 +71,21 @@ pub struct Key {
     pub b: u32,
 }
 
+impl Key {
+    /// The name of a tile of the `number`th texture of the scene.
+    #[must_use]
+    pub fn tile(number: u8, tile: Tile) -> Self {
+        // A level has less than 2^16 tiles along each side.
+        Self { layer: number, kind: Kind::Texture, a: tile.level, b: tile.y << 16 | tile.x }
+    }
+
+    /// The name of the coverage of the `number`th texture of the scene.
+    #[must_use]
+    pub fn coverage(number: u8) -> Self {
+        Self { layer: number, kind: Kind::TextureIndex, a: 0, b: 0 }
+    }
+}
+
 /// What a blob is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Kind {
@@ -81,6 +97,10 @@ pub enum Kind {
     Tin,
     /// A page of the index of triangles, zstd-compressed.
     TinIndex,
+    /// A tile of a texture: the key has the texture's position in the scene, the level, and the tile's y and x.
+    Texture,
+    /// Which tiles a texture has, zstd-compressed.
+    TextureIndex,
     /// A zone's masks, zstd-compressed; the key has layer 255 and the zone's position in the scene.
     Zone,
 }

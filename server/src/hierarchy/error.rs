@@ -3,9 +3,11 @@
 use super::transcribe::HEIGHT_METRES_MAX;
 use crate::ingest::IngestError;
 use crate::store::StoreError;
+use crate::texture::TextureError;
 use diamantina_protocol::bintree::ForestError;
 use diamantina_protocol::message::PAYLOAD_BYTES_MAX;
 use diamantina_protocol::points::{CodingError, SOURCE_MAX};
+use diamantina_protocol::texture::TEXTURES_MAX;
 use diamantina_protocol::tin::PatchError;
 use diamantina_protocol::zone::LAYERS_MAX;
 use std::io;
@@ -36,12 +38,26 @@ pub enum BuildError {
         /// What it was.
         error: Box<Self>,
     },
+    /// What went wrong with a texture.
+    #[error("texture '{texture}': {error}")]
+    Texture {
+        /// Its name.
+        texture: String,
+        /// What it was.
+        error: TextureError,
+    },
+    /// More than a scene may have.
+    #[error("{0} textures, expected at most {TEXTURES_MAX}: build several scenes")]
+    Textures(usize),
+    /// No quality.
+    #[error("--texture-quality {0}: expected 1 to 100")]
+    TextureQuality(u8),
     /// More than a scene may have.
     #[error("{0} layers, expected at most {LAYERS_MAX}: build several scenes")]
     Layers(usize),
     /// No name, or that of another layer.
     #[error(
-        "layer '{0}': expected a name that no other layer has, of 1 to 64 letters, digits, '-', '_' or '.', not starting \
+        "layer '{0}': expected a name that no other layer or texture has, of 1 to 64 letters, digits, '-', '_' or '.', not starting \
          with '.', and not 'zones'"
     )]
     LayerName(String),
@@ -199,7 +215,8 @@ impl BuildError {
     /// Whether the work folder is of use to another run: the source and the options are not to blame.
     pub(super) fn keeps_work(&self) -> bool {
         match self.cause() {
-            Self::Work { .. } | Self::Interrupted { .. } => true,
+            // Layers are done before textures.
+            Self::Work { .. } | Self::Interrupted { .. } | Self::Texture { .. } => true,
             Self::Store(error) => !matches!(error, StoreError::Spool { .. }),
             _ => false,
         }

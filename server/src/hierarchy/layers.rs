@@ -7,7 +7,9 @@ use super::plan::{Plan, held_bytes};
 use super::transcribe::find_quantum;
 use super::{BuildError, Options, forest_of, tins};
 use crate::ingest::{IngestError, Source};
+use crate::texture::{TextureSource, describe};
 use diamantina_protocol::message::{Kind, is_name};
+use diamantina_protocol::texture::TEXTURES_MAX;
 use diamantina_protocol::zone::LAYERS_MAX;
 
 /// A layer to be built: what it is called, what it is, and where its heights are from.
@@ -122,6 +124,31 @@ fn check(layers: &[LayerSource<'_>]) -> Result<(), BuildError> {
         if is_taken || !is_name(layer.name) || layer.name == "zones" {
             return Err(BuildError::LayerName(layer.name.to_owned()));
         }
+    }
+    Ok(())
+}
+
+/// Refuses textures that no scene with these layers can have.
+pub(super) fn check_textures(
+    layers: &[LayerSource<'_>],
+    textures: &[TextureSource<'_>],
+    options: &Options,
+) -> Result<(), BuildError> {
+    if !(1..=100).contains(&options.texture_quality) {
+        return Err(BuildError::TextureQuality(options.texture_quality));
+    }
+    if textures.len() > TEXTURES_MAX {
+        return Err(BuildError::Textures(textures.len()));
+    }
+    for (number, texture) in textures.iter().enumerate() {
+        // They stand in the same place of addresses.
+        let is_taken = layers.iter().any(|layer| layer.name == texture.name)
+            || textures[..number].iter().any(|other| other.name == texture.name);
+        if is_taken || !is_name(texture.name) || texture.name == "zones" {
+            return Err(BuildError::LayerName(texture.name.to_owned()));
+        }
+        let failed = |error| BuildError::Texture { texture: texture.name.to_owned(), error };
+        describe(*texture, options.texture_quality).map_err(failed)?;
     }
     Ok(())
 }

@@ -11,7 +11,7 @@
 //! 4. **Index.** Errors and ranges are saturated from the finest level up, and pages written.
 //!
 //! All sources are read first, so that what is wrong with one is found before hours of work on another; then layer after
-//! layer takes steps 2 to 4, and all are published as one version.
+//! layer takes steps 2 to 4, then each texture is cut into tiles ([`crate::texture`]), and all are published as one version.
 //!
 //! What is done is noted in a `journal`; a build that was killed goes on from there.
 //!
@@ -35,13 +35,15 @@ use crate::canvas::Canvas;
 use crate::ingest::{Grid, Source};
 use crate::progress::Progress;
 use crate::store::{Kind as BlobKind, Writer};
+use crate::texture::{self, TextureSource};
 use coding::fine_step;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::index::Entry;
 use diamantina_protocol::message::{Frame, Layer, Scene, TinLayer};
 use diamantina_protocol::points::{Coding, Rule};
+use diamantina_protocol::texture::Texture;
 use index::Sums;
-use layers::{Part, parts};
+use layers::{Part, check_textures, parts};
 use plan::Plan;
 use std::collections::HashSet;
 use std::path::Path;
@@ -77,8 +79,10 @@ pub struct Options {
     pub memory: u64,
     /// Whether to begin anew even where an interrupted build could be gone on with.
     pub fresh: bool,
-    /// Between two checkpoints: the most work that a kill costs.
+    /// Between two checkpoints: the most work that a kill costs. Tiles of textures are made anew.
     pub checkpoint: Duration,
+    /// How well textures keep their images: 1 to 99; 100 is lossless.
+    pub texture_quality: u8,
 }
 
 impl Options {
@@ -96,6 +100,7 @@ impl Options {
             memory: 2 << 30,
             fresh: false,
             checkpoint: CHECKPOINT,
+            texture_quality: texture::QUALITY,
         }
     }
 }
@@ -171,11 +176,26 @@ pub fn build_layers(
     options: &Options,
     progress: &Progress,
 ) -> Result<Report, BuildError> {
+    build_scene(layers, &[], out, options, progress)
+}
+
+/// As [`build_layers`], with textures, which lie in the same frame.
+///
+/// # Errors
+/// As [`build_layers`].
+pub fn build_scene(
+    layers: &[LayerSource<'_>],
+    textures: &[TextureSource<'_>],
+    out: &Path,
+    options: &Options,
+    progress: &Progress,
+) -> Result<Report, BuildError> {
     let started = Instant::now();
     // Wrong use is refused before an earlier run's work is touched.
     let parts = parts(layers, options)?;
+    check_textures(layers, textures, options)?;
     let writer = Writer::create(out)?;
-    let built = run(&parts, &writer, options, progress);
+    let built = run(&parts, textures, &writer, options, progress);
     progress.finish();
     match built {
         Ok((scene, sums)) => Ok(report(scene, &sums, started)),
@@ -200,6 +220,7 @@ fn forest_of(grid: &Grid, options: &Options) -> Result<Forest, BuildError> {
 /// Reads, codes, indexes and publishes; the scene, and what coding gave of each layer.
 fn run(
     parts: &[Part<'_>],
+    textures: &[TextureSource<'_>],
     writer: &Writer,
     options: &Options,
     progress: &Progress,
@@ -228,14 +249,18 @@ fn run(
         layers.push(layer);
         sums.push(sum);
     }
+    let textures = build_textures(textures, writer, options, &work)?;
     progress.of(None);
-    progress.stage("publish", "bytes", layers.iter().map(|layer| layer.bytes).sum(), 0);
+    let bytes =
+        layers.iter().map(|layer| layer.bytes).chain(textures.iter().map(|texture| texture.bytes)).sum();
+    progress.stage("publish", "bytes", bytes, 0);
     let scene = Scene {
         name: options.scene.clone(),
         version: String::new(),
         frame: frame(parts[0].layer.source),
         layers,
         zones: Vec::new(),
+        textures,
     };
     let go_on = |bytes| {
         progress.advance(bytes);
@@ -243,6 +268,24 @@ fn run(
     };
     let scene = writer.publish(scene, go_on)?.ok_or_else(|| work.interrupted())?;
     Ok((scene, sums))
+}
+
+/// Cuts imagery into tiles.
+fn build_textures(
+    sources: &[TextureSource<'_>],
+    writer: &Writer,
+    options: &Options,
+    work: &Work<'_>,
+) -> Result<Vec<Texture>, BuildError> {
+    let mut built = Vec::with_capacity(sources.len());
+    for (number, source) in (0u8..).zip(sources) {
+        work.progress.of(Some(source.name));
+        let failed = |error| BuildError::Texture { texture: source.name.to_owned(), error };
+        let texture = texture::build(*source, number, options.texture_quality, writer, work.progress)
+            .map_err(failed)?;
+        built.push(texture.ok_or_else(|| work.interrupted())?);
+    }
+    Ok(built)
 }
 
 /// Codes and indexes a layer that has been read.

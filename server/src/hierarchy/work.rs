@@ -93,6 +93,8 @@ fn fingerprint(parts: &[Part<'_>], options: &Options) -> Fingerprint {
         memory: _,
         fresh: _,
         checkpoint: _,
+        // Tiles are made anew.
+        texture_quality: _,
     } = options;
     let program = (
         env!("CARGO_PKG_VERSION"),

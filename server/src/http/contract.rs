@@ -15,6 +15,8 @@ pub(super) enum Holds {
     Html,
     Json,
     Octets,
+    /// A tile of a texture.
+    Picture,
     Metrics,
     /// Scripts, styles, programs.
     Files,
@@ -81,6 +83,7 @@ impl Holds {
             Self::Html => "text/html",
             Self::Json => "application/json",
             Self::Octets => "application/octet-stream",
+            Self::Picture => "image/webp",
             Self::Metrics => "application/openmetrics-text",
             Self::Files => "*/*",
         }
@@ -113,7 +116,7 @@ fn parameter(name: &str, place: ParameterIn, is_required: bool, form: Form) -> P
 fn operation(template: &str, about: &About) -> Operation {
     let mut operation = OperationBuilder::new().summary(Some(about.summary));
     for name in template.split('/').filter_map(|part| part.strip_prefix('{')?.strip_suffix('}')) {
-        let form = if matches!(name, "x" | "y" | "page") { Form::Count } else { Form::Name };
+        let form = if matches!(name, "x" | "y" | "page" | "level") { Form::Count } else { Form::Name };
         operation = operation.parameter(parameter(name, ParameterIn::Path, true, form));
     }
     for (name, is_required, form) in about.query {
@@ -125,7 +128,7 @@ fn operation(template: &str, about: &About) -> Operation {
     };
     let held = response(200, Some((about.holds.kind(), RefOr::T(schema.into()))));
     operation = operation.response("200", held);
-    if matches!(about.holds, Holds::Json | Holds::Octets | Holds::Html | Holds::Files) {
+    if matches!(about.holds, Holds::Json | Holds::Octets | Holds::Picture | Holds::Html | Holds::Files) {
         operation = operation.response("304", response(304, None));
         operation = operation.response("412", response(412, Some(problem())));
     }

@@ -21,6 +21,7 @@ use axum::routing::{MethodRouter, get};
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::index;
 use diamantina_protocol::message::{self, BATCH_MAX, Catalogue, Layer, STREAM_MAX, Scene};
+use diamantina_protocol::texture::Tile;
 use std::collections::HashMap;
 use std::sync::Arc;
 
@@ -95,11 +96,19 @@ fn lines() -> Vec<Line> {
         ),
         ("/scenes/{scene}/{layer}/height", HEIGHT, get(height_at)),
         (
+            "/scenes/{scene}/{version}/{layer}/texture/{level}/{x}/{y}",
+            About {
+                holds: Holds::Picture,
+                ..below("A tile of a texture, level 0 being the coarsest", &[404, 410, 500])
+            },
+            get(tile),
+        ),
+        (
             "/scenes/{scene}/{version}/zones/{zone}",
             below("What is seen from a zone, zstd-compressed", &[404, 410, 500]),
             get(zone),
         ),
-        ("/scenes/{scene}/{version}/{layer}/index/{page}", page, pages(points)),
+        ("/scenes/{scene}/{version}/{layer}/index/{page}", page, get(index_page)),
         ("/scenes/{scene}/{version}/{layer}/points", BATCH, batches(points)),
         ("/scenes/{scene}/{version}/{layer}/points/{x}/{y}", diamond, diamonds(points)),
         ("/scenes/{scene}/{version}/{layer}/tin/index/{page}", page, pages(tin)),
@@ -320,6 +329,52 @@ async fn page_of(
     let blob = site.blobs.get(&store, key).await?.ok_or_else(missing)?;
     let tag = format!("{version}-{number}-{}{page}", encoding.letters[1]);
     Ok(tagged(headers, &tag, cache, OCTETS, || blob.into()))
+}
+
+/// A page of a layer's points; or the only one of a texture, which tells of all tiles.
+async fn index_page(
+    State(site): State<Arc<Site>>,
+    caller: Caller,
+    path: PagePath,
+    headers: HeaderMap,
+) -> Result<Response, Refusal> {
+    let Path((name, version, texture, page)) = &path;
+    let (store, cache) = find_version(&site, caller, name, version)?;
+    let Some(number) = find_texture(&store, texture) else {
+        return page_of(&site, caller, path, &headers, points).await;
+    };
+    let missing = || Refusal::new(StatusCode::NOT_FOUND, "no such page: the index of a texture is page 0");
+    if page.parse::<u32>() != Ok(0) {
+        return Err(missing());
+    }
+    let blob = site.blobs.get(&store, Key::coverage(number)).await?.ok_or_else(missing)?;
+    Ok(tagged(&headers, &format!("{version}-x{number}"), cache, OCTETS, || blob.into()))
+}
+
+fn find_texture(store: &Store, name: &str) -> Option<u8> {
+    let position = store.scene().textures.iter().position(|texture| texture.name == name)?;
+    u8::try_from(position).ok()
+}
+
+async fn tile(
+    State(site): State<Arc<Site>>,
+    caller: Caller,
+    Path((name, version, texture, level, x, y)): Path<(String, String, String, String, String, String)>,
+    headers: HeaderMap,
+) -> Result<Response, Refusal> {
+    let (store, cache) = find_version(&site, caller, &name, &version)?;
+    let missing = |detail: &'static str| Refusal::new(StatusCode::NOT_FOUND, detail);
+    let number = find_texture(&store, &texture)
+        .ok_or_else(|| missing("no such texture: the scene's description lists them"))?;
+    let no_tile = || missing("no such tile: the texture's index tells which there are");
+    let digits = |text: &str| text.parse::<u32>().map_err(|_| no_tile());
+    let tile = Tile { level: digits(&level)?, x: digits(&x)?, y: digits(&y)? };
+    if !store.scene().textures[usize::from(number)].holds(tile) {
+        return Err(no_tile());
+    }
+    let blob = site.blobs.get(&store, Key::tile(number, tile)).await?.ok_or_else(no_tile)?;
+    let tag = format!("{version}-x{number}-{}-{}-{}", tile.level, tile.x, tile.y);
+    Ok(tagged(&headers, &tag, cache, "image/webp", || blob.into()))
 }
 
 async fn zone(

@@ -79,6 +79,7 @@ fn read(path: &Path, input: impl BufRead) -> Result<Raster> {
         height_offset: 0.0,
         height_doubt: None,
         nodata: header.nodata,
+        picture: None,
         samples: Samples::File(samples),
     })
 }

@@ -16,8 +16,8 @@ use tiff::decoder::{Decoder, DecodingResult};
 
 use super::error::{Result, broken, io_error, options, unsupported};
 use super::geokeys::GeoKeys;
-use super::raster::{Dtype, Place, Raster, SIDE_MAX, Samples, Window};
-use super::samples::decode;
+use super::raster::{Dtype, Picture, Place, Raster, SIDE_MAX, Samples, Wanted, Window};
+use super::samples::{band_of, decode};
 use super::tiff_header::{CHUNKS_MAX, Header};
 use super::units::named_metres;
 
@@ -25,6 +25,10 @@ use super::units::named_metres;
 const CHUNK_BYTES_MAX: u64 = 256 << 20;
 /// Idle decoders kept for each file: about one a core; each holds 16 bytes a chunk.
 const DECODERS_MAX: usize = 8;
+/// Bands of a file, at most.
+const BANDS_MAX: u32 = 64;
+/// The compression that pictures alone have.
+const JPEG: u64 = 7;
 /// What a decoder reads at once.
 const BUFFER_BYTES: usize = 1 << 16;
 
@@ -35,6 +39,8 @@ pub(super) struct Chunks {
     dtype: Dtype,
     big_endian: bool,
     compressed: bool,
+    /// Whether decoded chunks are brightness and two differences of colour.
+    ycbcr: bool,
     /// Byte offset and length of every chunk; length 0 is a hole, all nodata.
     places: Vec<(u64, u64)>,
     decoders: Mutex<Vec<Decoder<BufReader<Cursor>>>>,
@@ -51,6 +57,9 @@ struct Layout {
     chunk_width: u32,
     chunk_height: u32,
     tiled: bool,
+    /// Bands, and whether each has chunks of its own.
+    bands: u32,
+    planar: bool,
 }
 
 impl Layout {
@@ -60,6 +69,17 @@ impl Layout {
 
     fn down(&self) -> u32 {
         self.height.div_ceil(self.chunk_height)
+    }
+
+    /// Values at each place of a chunk.
+    fn interleaved(&self) -> u32 {
+        if self.planar { 1 } else { self.bands }
+    }
+
+    /// Chunks of all bands.
+    fn chunks(&self) -> u64 {
+        let planes = if self.planar { self.bands } else { 1 };
+        u64::from(self.across()) * u64::from(self.down()) * u64::from(planes)
     }
 
     /// Rows that a chunk stores: the last strip is shorter, tiles are padded.
@@ -73,13 +93,22 @@ impl Layout {
 }
 
 /// Opens a TIFF. The cache is shared by the files of a scene, `id` tells them apart.
-pub(super) fn open(path: &Path, file: File, cache: Arc<ChunkCache>, id: u32) -> Result<Raster> {
+pub(super) fn open(
+    path: &Path,
+    file: File,
+    cache: Arc<ChunkCache>,
+    id: u32,
+    wanted: Wanted,
+) -> Result<Raster> {
     let header = Header::read(path, &file)?;
-    let layout = layout(path, &header)?;
-    let dtype = dtype(path, &header)?;
+    let layout = layout(path, &header, wanted)?;
     let compression = header.integer(259)?.unwrap_or(1);
     let predictor = header.integer(317)?.unwrap_or(1);
-    check_method(path, compression, predictor)?;
+    let (dtype, picture) = match wanted {
+        Wanted::Heights => (dtype(path, &header)?, None),
+        Wanted::Imagery => (Dtype::U8, Some(picture(path, &header, layout, compression)?)),
+    };
+    check_method(path, compression, predictor, wanted)?;
     let compressed = compression != 1 || predictor != 1;
     let places = places(path, &header, layout, dtype, compressed)?;
     if header.has_mask() {
@@ -87,7 +116,12 @@ pub(super) fn open(path: &Path, file: File, cache: Arc<ChunkCache>, id: u32) -> 
             path,
             "nodata as a value of the samples",
             "a mask of valid samples beside them",
-            "write the mask into them, for instance with gdalwarp -dstnodata -32768",
+            match wanted {
+                Wanted::Heights => "write the mask into them, for instance with gdalwarp -dstnodata -32768",
+                Wanted::Imagery => {
+                    "make a band of it, with gdal_translate -b 1 -b 2 -b 3 -b mask -colorinterp_4 alpha"
+                }
+            },
         ));
     }
     let keys = GeoKeys::read(path, &header)?;
@@ -105,12 +139,14 @@ pub(super) fn open(path: &Path, file: File, cache: Arc<ChunkCache>, id: u32) -> 
     };
     let metadata = Metadata::read(&header)?;
     let big_endian = header.big_endian;
+    let ycbcr = compression == JPEG && header.integer(262)? == Some(6);
     let chunks = Chunks {
         file: Arc::new(file),
         layout,
         dtype,
         big_endian,
         compressed,
+        ycbcr,
         places,
         decoders: Mutex::new(Vec::new()),
         cache,
@@ -135,11 +171,12 @@ pub(super) fn open(path: &Path, file: File, cache: Arc<ChunkCache>, id: u32) -> 
         height_offset: metadata.offset * metres,
         height_doubt: vertical.err(),
         nodata,
+        picture,
         samples: Samples::Tiff(chunks),
     })
 }
 
-fn layout(path: &Path, header: &Header<'_>) -> Result<Layout> {
+fn layout(path: &Path, header: &Header<'_>, wanted: Wanted) -> Result<Layout> {
     let side = |tag, name: &str| -> Result<u32> {
         let value = header.integer(tag)?.unwrap_or(0);
         u32::try_from(value)
@@ -149,7 +186,7 @@ fn layout(path: &Path, header: &Header<'_>) -> Result<Layout> {
     };
     let (width, height) = (side(256, "a width")?, side(257, "a height")?);
     let bands = header.integer(277)?.unwrap_or(1);
-    if bands != 1 {
+    if bands != 1 && wanted == Wanted::Heights {
         return Err(unsupported(
             path,
             "one band of heights",
@@ -167,7 +204,43 @@ fn layout(path: &Path, header: &Header<'_>) -> Result<Layout> {
     if chunk_height == 0 {
         return Err(header.broken("at least one row a strip".to_owned(), "none".to_owned()));
     }
-    Ok(Layout { width, height, chunk_width, chunk_height, tiled })
+    let bands = u32::try_from(bands).ok().filter(|bands| (1..=BANDS_MAX).contains(bands));
+    let bands = bands.ok_or_else(|| header.broken(format!("1 to {BANDS_MAX} bands"), "others".to_owned()))?;
+    let planar = bands > 1 && header.integer(284)? == Some(2);
+    Ok(Layout { width, height, chunk_width, chunk_height, tiled, bands, planar })
+}
+
+/// What the bands of a picture are.
+fn picture(path: &Path, header: &Header<'_>, layout: Layout, compression: u64) -> Result<Picture> {
+    let photometric = header.integer(262)?.unwrap_or(1);
+    let bits = header.integers(258, u64::from(BANDS_MAX))?;
+    let formats = header.integers(339, u64::from(BANDS_MAX))?;
+    let is_bytes = bits.iter().all(|bits| *bits == 8) && !bits.is_empty() && formats.iter().all(|f| *f == 1);
+    let colours = match photometric {
+        1 => Some(1),
+        2 => Some(3),
+        6 if compression == JPEG => Some(3),
+        _ => None,
+    };
+    let Some(colours) = colours.filter(|colours| is_bytes && *colours <= layout.bands) else {
+        let found =
+            format!("{} bands of {bits:?} bits, photometric interpretation {photometric}", layout.bands);
+        let remedy = if photometric == 3 {
+            "convert it with gdal_translate -expand rgb"
+        } else {
+            "convert it, for instance with gdal_translate -ot Byte -scale -b 1 -b 2 -b 3 -colorinterp red,green,blue"
+        };
+        return Err(unsupported(
+            path,
+            "a picture of 8 bits a band: grey, or red, green and blue",
+            found,
+            remedy,
+        ));
+    };
+    // Of the bands beyond the colours, those marked as opacity: 1 is multiplied into the colours, 2 is not.
+    let extra = header.integers(338, u64::from(BANDS_MAX))?;
+    let opacity = (colours..layout.bands).zip(&extra).find(|(_, kind)| matches!(kind, 1 | 2));
+    Ok(Picture { colours, opacity: opacity.map(|(band, _)| band) })
 }
 
 fn dtype(path: &Path, header: &Header<'_>) -> Result<Dtype> {
@@ -196,8 +269,10 @@ fn dtype(path: &Path, header: &Header<'_>) -> Result<Dtype> {
     })
 }
 
-fn check_method(path: &Path, compression: u64, predictor: u64) -> Result<()> {
-    if matches!(compression, 1 | 5 | 8 | 32773 | 32946 | 50000) && matches!(predictor, 1..=3) {
+fn check_method(path: &Path, compression: u64, predictor: u64, wanted: Wanted) -> Result<()> {
+    let is_picture = wanted == Wanted::Imagery && compression == JPEG;
+    if (is_picture || matches!(compression, 1 | 5 | 8 | 32773 | 32946 | 50000)) && matches!(predictor, 1..=3)
+    {
         return Ok(());
     }
     Err(unsupported(
@@ -216,7 +291,7 @@ fn places(
     dtype: Dtype,
     compressed: bool,
 ) -> Result<Vec<(u64, u64)>> {
-    let chunks = u64::from(layout.across()) * u64::from(layout.down());
+    let chunks = layout.chunks();
     let (offset_tag, count_tag) = if layout.tiled { (324, 325) } else { (273, 279) };
     let found = header.count(offset_tag);
     if chunks > CHUNKS_MAX || found != chunks || header.count(count_tag) != chunks {
@@ -225,7 +300,7 @@ fn places(
             format!("{found} offsets and {} lengths", header.count(count_tag)),
         ));
     }
-    let row_bytes = u64::from(layout.chunk_width) * dtype.bytes() as u64;
+    let row_bytes = u64::from(layout.chunk_width) * dtype.bytes() as u64 * u64::from(layout.interleaved());
     let chunk_bytes = row_bytes.saturating_mul(u64::from(layout.chunk_height));
     if compressed && chunk_bytes > CHUNK_BYTES_MAX {
         return Err(unsupported(
@@ -242,7 +317,7 @@ fn places(
         if *length == 0 {
             continue;
         }
-        let needed = row_bytes * u64::from(layout.stored_rows(i / layout.across()));
+        let needed = row_bytes * u64::from(layout.stored_rows(i / layout.across() % layout.down()));
         let ends = offset.checked_add(if compressed { *length } else { needed.max(*length) });
         if ends.is_none_or(|end| end > header.length) || (!compressed && *length < needed) {
             return Err(broken(
@@ -320,19 +395,22 @@ impl Metadata {
 }
 
 impl Chunks {
-    /// Values as stored, rows from the south.
-    pub(super) fn read(&self, path: &Path, window: Window, out: &mut [f64]) -> Result<()> {
+    /// Values of a band as stored, rows from the south.
+    pub(super) fn read(&self, path: &Path, window: Window, band: u32, out: &mut [f64]) -> Result<()> {
         if window.samples() == 0 {
             return Ok(());
         }
         let l = self.layout;
         let north = l.height - window.y0 - window.height;
+        // Bands either share chunks or follow each other.
+        let (first_chunk, band) = if l.planar { (band * l.across() * l.down(), 0) } else { (0, band) };
         let (columns, rows) = (window.x0..window.x0 + window.width, north..north + window.height);
         for chunk_row in rows.start / l.chunk_height..=(rows.end - 1) / l.chunk_height {
             for chunk_column in columns.start / l.chunk_width..=(columns.end - 1) / l.chunk_width {
                 let (left, top) = (chunk_column * l.chunk_width, chunk_row * l.chunk_height);
                 let part = Part {
-                    chunk: chunk_row * l.across() + chunk_column,
+                    chunk: first_chunk + chunk_row * l.across() + chunk_column,
+                    band,
                     columns: columns.start.max(left)..columns.end.min(left + l.chunk_width),
                     rows: rows.start.max(top)..rows.end.min(top + l.chunk_height),
                     left,
@@ -364,25 +442,28 @@ impl Chunks {
         let (offset, length) = self.places[part.chunk as usize];
         let skip = (part.columns.start - part.left) as usize;
         let stride = self.layout.chunk_width as usize;
+        let bands = self.layout.interleaved();
+        let at_once = bands as usize;
         if length == 0 {
             part.rows.clone().for_each(|row| out[target(row)].fill(self.hole));
         } else if self.compressed {
             let data = self.chunk(path, part.chunk)?;
             for row in part.rows.clone() {
-                let from = (row - part.top) as usize * stride + skip;
-                if !copy(&data, from, &mut out[target(row)]) {
+                let from = ((row - part.top) as usize * stride + skip) * at_once + part.band as usize;
+                if !copy(&data, from, at_once, &mut out[target(row)]) {
                     return Err(self.short_chunk(path, part.chunk));
                 }
             }
         } else {
             let size = self.dtype.bytes();
-            let mut bytes = vec![0; part.columns.len() * size];
+            let mut bytes = vec![0; part.columns.len() * size * at_once];
             for row in part.rows.clone() {
-                let at = ((row - part.top) as usize * stride + skip) * size;
+                let at = ((row - part.top) as usize * stride + skip) * size * at_once;
                 self.file
                     .read_exact_at(&mut bytes, offset + at as u64)
                     .map_err(io_error(path, "read samples"))?;
-                decode(&bytes, self.dtype, self.big_endian, out[target(row)].iter_mut());
+                let values = band_of(&mut bytes, size, bands, part.band);
+                decode(values, self.dtype, self.big_endian, out[target(row)].iter_mut());
             }
         }
         Ok(())
@@ -401,12 +482,18 @@ impl Chunks {
         // With its padding, in one piece: read row by row, the crate (0.11.3) takes the end of some LZW tiles for
         // damage, where a row's padding and the data end together.
         let mut data = DecodingResult::U8(Vec::new());
-        let row_bytes = self.layout.chunk_width as usize * self.dtype.bytes();
+        let row_bytes =
+            self.layout.chunk_width as usize * self.dtype.bytes() * self.layout.interleaved() as usize;
         decoder.read_chunk_to_buffer(&mut data, chunk, row_bytes).map_err(|e| {
             let found = format!("an error in strip or tile {chunk} ({e})");
             broken(path, "samples that unpack", found, "the file is damaged: fetch it again")
         })?;
         self.keep(decoder);
+        if let DecodingResult::U8(values) = &mut data
+            && self.ycbcr
+        {
+            values.as_chunks_mut::<3>().0.iter_mut().for_each(|pixel| *pixel = rgb(*pixel));
+        }
         let data = Arc::new(data);
         self.cache.put((self.id, chunk), &data);
         Ok(data)
@@ -436,18 +523,28 @@ impl Chunks {
 /// The share of a window that lies in one chunk, in columns and rows of the raster.
 struct Part {
     chunk: u32,
+    /// Of those that share the chunk.
+    band: u32,
     columns: std::ops::Range<u32>,
     rows: std::ops::Range<u32>,
     left: u32,
     top: u32,
 }
 
-/// Copies samples from `from` on; false if there are too few or the type is unexpected.
-fn copy(data: &DecodingResult, from: usize, out: &mut [f64]) -> bool {
+/// Red, green and blue of brightness and differences of colour, as JPEG has them (ITU-T T.871).
+fn rgb([y, cb, cr]: [u8; 3]) -> [u8; 3] {
+    let (y, cb, cr) = (f32::from(y), f32::from(cb) - 128.0, f32::from(cr) - 128.0);
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "conversion saturates")]
+    [y + 1.402 * cr, y - 0.344_136 * cb - 0.714_136 * cr, y + 1.772 * cb].map(|value| value.round() as u8)
+}
+
+/// Copies every `step`th sample from `from` on; false if there are too few or the type is unexpected.
+fn copy(data: &DecodingResult, from: usize, step: usize, out: &mut [f64]) -> bool {
     macro_rules! each {
         ($samples:expr) => {{
-            let Some(samples) = $samples.get(from..from + out.len()) else { return false };
-            out.iter_mut().zip(samples).for_each(|(o, s)| *o = f64::from(*s));
+            let needed = (out.len() * step).saturating_sub(step - 1);
+            let Some(samples) = $samples.get(from..from + needed) else { return false };
+            out.iter_mut().zip(samples.iter().step_by(step)).for_each(|(o, s)| *o = f64::from(*s));
             true
         }};
     }

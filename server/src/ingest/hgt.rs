@@ -40,6 +40,7 @@ pub(super) fn open(path: &Path, file: File, name: &str) -> Result<Raster> {
         order: Order::RowsFromNorth,
         width: side,
         height: side,
+        bands: 1,
     };
     Ok(Raster {
         file: path.to_owned(),
@@ -52,6 +53,7 @@ pub(super) fn open(path: &Path, file: File, name: &str) -> Result<Raster> {
         height_offset: 0.0,
         height_doubt: None,
         nodata: Some(-32768.0),
+        picture: None,
         samples: Samples::File(samples),
     })
 }

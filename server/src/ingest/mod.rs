@@ -7,8 +7,10 @@
 //! start to end is transcribed once to a temporary file (8 bytes a sample, 1 or 2 for PNG).
 //!
 //! ```text
-//! (packed →) geotiff hgt ascii_grid usgs_dem png raw → raster → mosaic → (as it is | reproject) → windows
+//! (packed →) geotiff hgt ascii_grid usgs_dem png jpeg raw → raster → mosaic → (as it is | reproject) → windows
 //! ```
+//!
+//! Imagery goes the same way, band by band: see [`Imagery`].
 //!
 //! Files may be hostile: every size is checked before memory is taken, and what is wrong is an
 //! [`IngestError`] that names the file, what was expected, what was found and the remedy.
@@ -18,6 +20,8 @@ mod error;
 mod geokeys;
 mod geotiff;
 mod hgt;
+mod imagery;
+mod jpeg;
 mod mosaic;
 mod over;
 mod packed;
@@ -31,6 +35,7 @@ mod tests;
 mod tiff_header;
 mod units;
 mod usgs_dem;
+mod world_file;
 
 use std::fmt;
 use std::fs::File;
@@ -41,6 +46,7 @@ use std::str::FromStr;
 use std::sync::Arc;
 
 pub use error::IngestError;
+pub use imagery::Imagery;
 pub use over::{level, open_over};
 
 use crate::projection;
@@ -48,7 +54,7 @@ use error::{Result, broken, io_error, options as bad_options, unsupported};
 use geotiff::ChunkCache;
 use mosaic::Mosaic;
 use over::Base;
-use raster::{Dtype, Place, Raster, SIDE_MAX, Samples, SourceCrs, Window};
+use raster::{Dtype, Place, Raster, SIDE_MAX, Samples, SourceCrs, Wanted, Window};
 use reproject::Reprojection;
 use samples::{Order, SampleFile};
 
@@ -267,7 +273,7 @@ fn open_with(
     check_numbers(first, options)?;
     let mut rasters = Vec::with_capacity(paths.len());
     for path in paths {
-        let mut raster = open_file(path, options, &cache)?;
+        let mut raster = open_file(path, options, &cache, Wanted::Heights)?;
         override_values(&mut raster, options)?;
         assume_crs(&mut raster, options)?;
         rasters.push(raster);
@@ -363,8 +369,8 @@ impl Source {
         }
         match &self.heights {
             Heights::Files(files) => match &files.reprojection {
-                Some(reprojection) => reprojection.read(&files.mosaic, window, out),
-                None => files.mosaic.read(window, out),
+                Some(reprojection) => reprojection.read(&files.mosaic, window, 0, out),
+                None => files.mosaic.read(window, 0, out),
             },
             Heights::Level => {
                 out.fill(0.0);
@@ -408,7 +414,7 @@ fn check_grid(file: &Path, grid: &Grid) -> Result<()> {
 }
 
 /// Opens one file, whatever its format.
-fn open_file(path: &Path, options: &Options, cache: &Arc<ChunkCache>) -> Result<Raster> {
+fn open_file(path: &Path, options: &Options, cache: &Arc<ChunkCache>, wanted: Wanted) -> Result<Raster> {
     // Before it is opened: opening a pipe would wait for somebody to write into it.
     let metadata = path.metadata().map_err(io_error(path, "open it"))?;
     if metadata.is_dir() {
@@ -422,7 +428,7 @@ fn open_file(path: &Path, options: &Options, cache: &Arc<ChunkCache>) -> Result<
     let name = path.file_name().and_then(|n| n.to_str()).unwrap_or_default().to_ascii_lowercase();
     let mut magic = [0; 2];
     let gzipped = file.read_exact_at(&mut magic, 0).is_ok() && magic == [0x1f, 0x8b];
-    if let Some(shape) = options.raw {
+    if let Some(shape) = options.raw.filter(|_| wanted == Wanted::Heights) {
         // Bare samples may begin with any bytes.
         let file = if gzipped && name.ends_with(".gz") { packed::gunzip(path, file)? } else { file };
         return open_raw(path, file, shape);
@@ -434,7 +440,10 @@ fn open_file(path: &Path, options: &Options, cache: &Arc<ChunkCache>) -> Result<
     } else {
         (file, name)
     };
-    detect(path, file, &name, cache)
+    match wanted {
+        Wanted::Heights => detect(path, file, &name, cache),
+        Wanted::Imagery => imagery::detect(path, file, cache),
+    }
 }
 
 /// Chooses the format by content; `.hgt` alone has no mark of its own and goes by `name` (lower case).
@@ -448,9 +457,9 @@ fn detect(path: &Path, file: File, name: &str, cache: &Arc<ChunkCache>) -> Resul
         [] => Err(broken(path, "a DEM", "an empty file", "fetch it again")),
         _ if name.ends_with(".hgt") => hgt::open(path, file, name),
         [b'I', b'I', 42 | 43, 0, ..] | [b'M', b'M', 0, 42 | 43, ..] => {
-            geotiff::open(path, file, Arc::clone(cache), cache.name())
+            geotiff::open(path, file, Arc::clone(cache), cache.name(), Wanted::Heights)
         }
-        [0x89, b'P', b'N', b'G', ..] => png::open(path, file),
+        [0x89, b'P', b'N', b'G', ..] => png::open(path, file, Wanted::Heights),
         _ if text.starts_with(b"ncols") || text.starts_with(b"nrows") => ascii_grid::open(path, file),
         _ if usgs_dem::looks_like(&start) => usgs_dem::open(path, &file),
         _ => {
@@ -472,7 +481,8 @@ fn detect(path: &Path, file: File, name: &str, cache: &Arc<ChunkCache>) -> Resul
 
 fn open_raw(path: &Path, file: File, shape: RawShape) -> Result<Raster> {
     let RawShape { width, height, dtype } = shape;
-    let samples = SampleFile { file, dtype, big_endian: false, order: Order::RowsFromNorth, width, height };
+    let samples =
+        SampleFile { file, dtype, big_endian: false, order: Order::RowsFromNorth, width, height, bands: 1 };
     samples.check_length(path)?;
     Ok(Raster {
         file: path.to_owned(),
@@ -485,6 +495,7 @@ fn open_raw(path: &Path, file: File, shape: RawShape) -> Result<Raster> {
         height_offset: 0.0,
         height_doubt: None,
         nodata: None,
+        picture: None,
         samples: Samples::File(samples),
     })
 }

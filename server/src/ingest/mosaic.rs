@@ -77,11 +77,11 @@ impl Mosaic {
         self.parts.iter().all(|(raster, ..)| raster.integer)
     }
 
-    /// Fills `out` with the window's values, rows from the south, NaN for nodata and gaps.
-    pub(super) fn read(&self, window: Window, out: &mut [f64]) -> Result<()> {
+    /// Fills `out` with the window's values, rows from the south, NaN for nodata and gaps. `band` is for pictures.
+    pub(super) fn read(&self, window: Window, band: u32, out: &mut [f64]) -> Result<()> {
         if let [(raster, ..)] = &self.parts[..] {
-            raster.read(window, out)?;
-            self.seen.note(0, out);
+            raster.read(window, band, out)?;
+            self.note(0, raster, out);
             return Ok(());
         }
         out.fill(f64::NAN);
@@ -91,8 +91,8 @@ impl Mosaic {
             let own = Window { x0: common.x0 - x, y0: common.y0 - y, ..common };
             scratch.clear();
             scratch.resize(own.samples(), f64::NAN);
-            raster.read(own, &mut scratch)?;
-            self.seen.note(number, &scratch);
+            raster.read(own, band, &mut scratch)?;
+            self.note(number, raster, &scratch);
             let left = (common.x0 - window.x0) as usize;
             let rows = out.chunks_exact_mut(window.width as usize).skip((common.y0 - window.y0) as usize);
             for (row, from) in rows.zip(scratch.chunks_exact(common.width as usize)) {
@@ -104,6 +104,15 @@ impl Mosaic {
             }
         }
         Ok(())
+    }
+}
+
+impl Mosaic {
+    /// Looks for heights that are none.
+    fn note(&self, number: usize, raster: &Raster, values: &[f64]) {
+        if raster.picture.is_none() {
+            self.seen.note(number, values);
+        }
     }
 }
 

@@ -58,7 +58,12 @@ fn is_same(a: &SourceCrs, b: &SourceCrs) -> bool {
 }
 
 /// The lattice of some files in a frame.
-fn lay(file: &Path, mosaic: &Mosaic, options: &Options, base: &Base) -> Result<(Grid, Option<Reprojection>)> {
+pub(super) fn lay(
+    file: &Path,
+    mosaic: &Mosaic,
+    options: &Options,
+    base: &Base,
+) -> Result<(Grid, Option<Reprojection>)> {
     let own = mosaic.place.as_ref().and_then(|place| Some((place, place.crs.as_ref()?)));
     let first = base.file.display();
     match (&base.crs, own) {

@@ -151,21 +151,81 @@ pub(super) struct Raster {
     /// What the file says of its heights, where it is unclear how many metres a value is.
     pub(super) height_doubt: Option<String>,
     pub(super) nodata: Option<f64>,
+    /// What its bands are, if it is a picture: then it has no heights.
+    pub(super) picture: Option<Picture>,
     pub(super) samples: Samples,
 }
 
+/// What is to be read from files.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Wanted {
+    /// One band of heights.
+    Heights,
+    /// Bands of 8 bits: grey, or red, green and blue, and perhaps how opaque they are.
+    Imagery,
+}
+
+/// The bands of a picture.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Picture {
+    /// 1 (grey) or 3 (red, green, blue): the first ones of the file.
+    pub(super) colours: u32,
+    /// The band that tells how opaque a pixel is, if there is one.
+    pub(super) opacity: Option<u32>,
+}
+
+/// The band by which the opacity of a picture is asked for; 0 to 2 are red, green and blue.
+pub(super) const OPACITY: u32 = 3;
+
+/// The value of an opaque pixel.
+const OPAQUE: f64 = 255.0;
+
 impl Raster {
-    /// Fills `out` (as long as the window, rows from the south) with values, NaN for nodata.
-    pub(super) fn read(&self, window: Window, out: &mut [f64]) -> Result<()> {
+    /// Fills `out` (as long as the window, rows from the south) with values, NaN for nodata. `band` is for pictures.
+    pub(super) fn read(&self, window: Window, band: u32, out: &mut [f64]) -> Result<()> {
         debug_assert_eq!(out.len(), window.samples());
-        match &self.samples {
-            Samples::Tiff(chunks) => chunks.read(&self.file, window, out)?,
-            Samples::File(samples) => samples.read(&self.file, window, out)?,
+        if let Some(picture) = self.picture {
+            return self.read_picture(picture, window, band, out);
         }
+        self.stored(window, 0, out)?;
         // Without nodata this compares with NaN, which equals nothing.
         let nodata = self.nodata.unwrap_or(f64::NAN);
         for value in out {
             if *value == nodata || !value.is_finite() {
+                *value = f64::NAN;
+            }
+        }
+        Ok(())
+    }
+
+    /// Values as the file has them.
+    fn stored(&self, window: Window, band: u32, out: &mut [f64]) -> Result<()> {
+        match &self.samples {
+            Samples::Tiff(chunks) => chunks.read(&self.file, window, band, out),
+            Samples::File(samples) => samples.read(&self.file, window, band, out),
+        }
+    }
+
+    /// A band of a picture; NaN where nothing is to be seen, so that no colour comes from there.
+    fn read_picture(&self, picture: Picture, window: Window, band: u32, out: &mut [f64]) -> Result<()> {
+        match if band == OPACITY { picture.opacity } else { Some(band.min(picture.colours - 1)) } {
+            Some(own) => self.stored(window, own, out)?,
+            None => out.fill(OPAQUE),
+        }
+        let mut other = vec![0.0; out.len()];
+        if let Some(opacity) = picture.opacity {
+            self.stored(window, opacity, &mut other)?;
+            for (value, _) in out.iter_mut().zip(&other).filter(|(_, opacity)| **opacity == 0.0) {
+                *value = f64::NAN;
+            }
+        }
+        if let Some(nodata) = self.nodata {
+            let mut is_empty = vec![true; out.len()];
+            for colour in 0..picture.colours {
+                self.stored(window, colour, &mut other)?;
+                is_empty.iter_mut().zip(&other).for_each(|(is_empty, value)| *is_empty &= *value == nodata);
+            }
+            for (value, _) in out.iter_mut().zip(is_empty).filter(|(_, is_empty)| *is_empty) {
                 *value = f64::NAN;
             }
         }

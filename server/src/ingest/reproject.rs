@@ -165,7 +165,7 @@ impl Reprojection {
 
     /// Fills `out` with the window's values, rows from the south. About 2 MiB beside the source's own, up to
     /// 10 MiB where the target is much coarser than the source.
-    pub(super) fn read(&self, mosaic: &Mosaic, window: Window, out: &mut [f64]) -> Result<()> {
+    pub(super) fn read(&self, mosaic: &Mosaic, window: Window, band: u32, out: &mut [f64]) -> Result<()> {
         let mut positions = Vec::new();
         let mut region = Vec::new();
         let width = window.width as usize;
@@ -184,6 +184,7 @@ impl Reprojection {
                 let all = Window { x0: 0, y0: 0, ..part };
                 self.sample(
                     mosaic,
+                    band,
                     &positions,
                     part.width as usize,
                     all,
@@ -260,6 +261,7 @@ impl Reprojection {
     fn sample(
         &self,
         mosaic: &Mosaic,
+        band: u32,
         positions: &[[f64; 2]],
         stride: usize,
         rect: Window,
@@ -274,13 +276,13 @@ impl Reprojection {
         };
         if u64::from(area.width) * u64::from(area.height) > REGION_SAMPLES_MAX && rect.samples() > 1 {
             for half in halves(rect) {
-                self.sample(mosaic, positions, stride, half, out_stride, out, region)?;
+                self.sample(mosaic, band, positions, stride, half, out_stride, out, region)?;
             }
             return Ok(());
         }
         region.clear();
         region.resize(area.samples(), f64::NAN);
-        mosaic.read(area, region)?;
+        mosaic.read(area, band, region)?;
         share.each(|x, y, position| {
             let at = inside(position, self.source_size);
             out[y * out_stride + x] = at.map_or(f64::NAN, |at| bilinear(region, area, at));

@@ -26,13 +26,15 @@ pub(super) struct SampleFile {
     pub(super) order: Order,
     pub(super) width: u32,
     pub(super) height: u32,
+    /// Values at each place, one after the other: more than one only of rows from the north.
+    pub(super) bands: u32,
 }
 
 impl SampleFile {
     /// Checks that the file has as many bytes as its shape needs.
     pub(super) fn check_length(&self, path: &Path) -> Result<()> {
         let found = self.file.metadata().map_err(io_error(path, "ask for its length"))?.len();
-        let expected = u64::from(self.width) * u64::from(self.height) * self.dtype.bytes() as u64;
+        let expected = u64::from(self.width) * u64::from(self.height) * self.place_bytes() as u64;
         if found == expected {
             return Ok(());
         }
@@ -45,18 +47,27 @@ impl SampleFile {
         ))
     }
 
-    /// Values as stored. One positioned read for each row (or column) of the window.
-    pub(super) fn read(&self, path: &Path, window: Window, out: &mut [f64]) -> Result<()> {
+    fn place_bytes(&self) -> usize {
+        self.dtype.bytes() * self.bands as usize
+    }
+
+    /// Values of a band as stored. One positioned read for each row (or column) of the window.
+    pub(super) fn read(&self, path: &Path, window: Window, band: u32, out: &mut [f64]) -> Result<()> {
         let (w, h) = (window.width as usize, window.height as usize);
         let size = self.dtype.bytes();
         match self.order {
             Order::RowsFromNorth => {
-                let mut bytes = vec![0; w * size];
+                let mut bytes = vec![0; w * self.place_bytes()];
                 for (y, row) in (window.y0..).zip(out.chunks_exact_mut(w.max(1))) {
                     let before =
                         u64::from(self.height - 1 - y) * u64::from(self.width) + u64::from(window.x0);
                     self.read_at(path, before, &mut bytes)?;
-                    decode(&bytes, self.dtype, self.big_endian, row.iter_mut());
+                    decode(
+                        band_of(&mut bytes, size, self.bands, band),
+                        self.dtype,
+                        self.big_endian,
+                        row.iter_mut(),
+                    );
                 }
             }
             Order::ColumnsFromSouth => {
@@ -72,9 +83,23 @@ impl SampleFile {
     }
 
     fn read_at(&self, path: &Path, samples_before: u64, bytes: &mut [u8]) -> Result<()> {
-        let at = samples_before * self.dtype.bytes() as u64;
+        let at = samples_before * self.place_bytes() as u64;
         self.file.read_exact_at(bytes, at).map_err(io_error(path, "read samples"))
     }
+}
+
+/// Moves the values of one band, of `size` bytes each, to the front of those of all bands.
+pub(super) fn band_of(bytes: &mut [u8], size: usize, bands: u32, band: u32) -> &[u8] {
+    let (bands, band) = (bands as usize, band as usize);
+    if bands == 1 {
+        return bytes;
+    }
+    let places = bytes.len() / (bands * size);
+    for place in 0..places {
+        let from = (place * bands + band) * size;
+        bytes.copy_within(from..from + size, place * size);
+    }
+    &bytes[..places * size]
 }
 
 /// Turns bytes into values, one for each place of `out`.
@@ -130,7 +155,8 @@ impl Transcript {
     pub(super) fn finish(self, path: &Path, order: Order, width: u32, height: u32) -> Result<SampleFile> {
         let file =
             self.writer.into_inner().map_err(|e| io_error(path, "write a temporary file")(e.into_error()))?;
-        let samples = SampleFile { file, dtype: Dtype::F64, big_endian: false, order, width, height };
+        let samples =
+            SampleFile { file, dtype: Dtype::F64, big_endian: false, order, width, height, bands: 1 };
         samples.check_length(path)?;
         Ok(samples)
     }

@@ -120,6 +120,7 @@ pub(super) fn open(path: &Path, file: &File) -> Result<Raster> {
         height_offset: 0.0,
         height_doubt: None,
         nodata: None,
+        picture: None,
         samples: Samples::File(samples),
     })
 }

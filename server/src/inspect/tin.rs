@@ -151,7 +151,7 @@ impl Reader<'_> {
                         None => strays += 1,
                     }
                 }
-                Kind::Index | Kind::Points | Kind::Zone => {}
+                Kind::Index | Kind::Points | Kind::Zone | Kind::Texture | Kind::TextureIndex => {}
             }
         }
         if strays > 0 {

@@ -69,6 +69,8 @@ fn kind_code(kind: Kind) -> u8 {
         Kind::Points => 2,
         Kind::Tin => 3,
         Kind::TinIndex => 4,
+        Kind::Texture => 5,
+        Kind::TextureIndex => 6,
         Kind::Zone => 16,
     }
 }
@@ -105,6 +107,8 @@ fn read_directory(bytes: &[u8], pack_bytes: &[u64]) -> Result<Vec<(Key, Place)>,
             2 => Kind::Points,
             3 => Kind::Tin,
             4 => Kind::TinIndex,
+            5 => Kind::Texture,
+            6 => Kind::TextureIndex,
             16 => Kind::Zone,
             other => return Err(format!("directory has a blob of kind {other}")),
         };

@@ -12,8 +12,9 @@ use super::{
 };
 use bytes::Bytes;
 use diamantina_protocol::message::{
-    Scene, index_route, points_route, scene_route, tin_index_route, tin_route, zone_route,
+    Scene, index_route, points_route, scene_route, tile_route, tin_index_route, tin_route, zone_route,
 };
+use diamantina_protocol::texture::Tile;
 use futures_util::StreamExt;
 use std::collections::{BTreeMap, HashMap};
 use std::fs::{self, File};
@@ -319,6 +320,14 @@ fn route(scene: &Scene, key: Key) -> Option<String> {
     if key.kind == Kind::Zone {
         return Some(zone_route(name, version, &scene.zones.get(key.a as usize)?.name));
     }
+    if matches!(key.kind, Kind::Texture | Kind::TextureIndex) {
+        let texture = &scene.textures.get(usize::from(key.layer))?.name;
+        let tile = Tile { level: key.a, x: key.b & 0xffff, y: key.b >> 16 };
+        return Some(match key.kind {
+            Kind::Texture => tile_route(name, version, texture, tile),
+            _ => index_route(name, version, texture, 0),
+        });
+    }
     let layer = &scene.layers.get(usize::from(key.layer))?.name;
     let centre = [key.a, key.b];
     Some(match key.kind {
@@ -326,7 +335,7 @@ fn route(scene: &Scene, key: Key) -> Option<String> {
         Kind::TinIndex => tin_index_route(name, version, layer, key.a),
         Kind::Points => points_route(name, version, layer, centre),
         Kind::Tin => tin_route(name, version, layer, centre),
-        Kind::Zone => return None,
+        Kind::Texture | Kind::TextureIndex | Kind::Zone => return None,
     })
 }
 
