@@ -9,8 +9,10 @@ struct Vertex {
     // The instance's: lattice point (0, 0) relative to the reference point; lattice steps of u and v.
     @location(3) origin: vec2<i32>,
     @location(4) axes: vec4<i32>,
-    // x: the level. y: the moment to draw, in ticks. z: ticks that a motion takes.
-    @location(5) about: vec3<i32>,
+    // x: the level. y: the moment to draw, in ticks. z: ticks that a motion takes. w: the first tile of imagery.
+    @location(5) about: vec4<i32>,
+    // Where in that tile a place lies: xy the eye, zw what a metre is.
+    @location(10) drape: vec4<f32>,
 }
 
 // The motion of a point: see client/src/morph.rs.
@@ -34,7 +36,8 @@ struct Corner {
     // The instance's: the centre relative to the reference point. The others are as above.
     @location(3) origin: vec2<i32>,
     @location(4) axes: vec4<i32>,
-    @location(5) about: vec3<i32>,
+    @location(5) about: vec4<i32>,
+    @location(10) drape: vec4<f32>,
 }
 
 struct Shaded {
@@ -43,27 +46,34 @@ struct Shaded {
     @location(0) about: vec3<f32>,
     // In metres. A plane's is interpolated without error, as its distance would not be.
     @location(1) from_eye: vec3<f32>,
+    // Where in the first tile of imagery, from 0 to 1 east and north, and which that is.
+    @location(2) drape: vec2<f32>,
+    @location(3) @interpolate(flat) tile: u32,
 }
 
 // A lattice point, relative to the reference point, drawn `lift` quanta above its own height. Up to the conversion to
 // f32 all is exact, and from there on a function of the lattice point, the height and the lift alone: so two diamonds
 // give a point that they share the same bits, whether they move or not.
-fn placed(lattice: vec2<i32>, height: i32, lift: f32, normal: vec2<f32>, level: i32) -> Shaded {
+fn placed(
+    lattice: vec2<i32>, height: i32, lift: f32, normal: vec2<f32>, about: vec4<i32>, drape: vec4<f32>,
+) -> Shaded {
     let across = vec2<f32>(lattice) * layer.cell + layer.offset;
     let still = f32(height - layer.height) * layer.quantum + layer.up_offset;
     let up = select(still + lift * layer.quantum, still, lift == 0.0);
     let from_eye = vec3<f32>(across, up);
     return Shaded(
         frame.clip_from_eye * vec4<f32>(from_eye, 1.0),
-        vec3<f32>(normal, f32(level)),
+        vec3<f32>(normal, f32(about.x)),
         from_eye,
+        drape.xy + drape.zw * across,
+        u32(about.w),
     );
 }
 
 fn shaded(vertex: Vertex, lift: f32, normal: vec2<f32>) -> Shaded {
     let p = vec2<i32>(vertex.place);
     let lattice = vertex.origin + ((vertex.axes.xy * p.x + vertex.axes.zw * p.y) >> vec2<u32>(1u));
-    return placed(lattice, vertex.height, lift, normal, vertex.about.x);
+    return placed(lattice, vertex.height, lift, normal, vertex.about, vertex.drape);
 }
 
 @vertex
@@ -84,7 +94,7 @@ fn terrain_morph_vertex(vertex: Vertex, motion: Motion) -> Shaded {
 
 @vertex
 fn tin_vertex(corner: Corner) -> Shaded {
-    return placed(corner.origin + corner.place, corner.height, 0.0, corner.normal, corner.about.x);
+    return placed(corner.origin + corner.place, corner.height, 0.0, corner.normal, corner.about, corner.drape);
 }
 
 // The unit normal, of the stretched surface.

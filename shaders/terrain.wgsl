@@ -48,12 +48,16 @@ fn level_tint(level: f32) -> vec3<f32> {
 
 fn terrain_colour(shaded: Shaded) -> vec4<f32> {
     let normal = normal_of(shaded);
+    let imagery = imagery_at(shaded.tile, shaded.drape, dpdx(shaded.drape), dpdy(shaded.drape)) * frame.drape.y;
     let height = (frame.sun.w + shaded.from_eye.z) / layer.exaggeration;
     var albedo = albedo_at(height, max(fwidth(height), 1e-6), normal.z);
     if frame.options.y != 0.0 {
         albedo = mix(albedo, level_tint(round(shaded.about.z)), 0.5);
     }
-    return encoded(hazed(lit(albedo, normal), shaded.from_eye));
+    // Pictures of the ground have its light in them already: how much more they get is for the viewer to say.
+    let light = lit(vec3<f32>(1.0), normal);
+    let colour = albedo * light * (1.0 - imagery.a) + imagery.rgb * mix(vec3<f32>(1.0), light, frame.drape.x);
+    return encoded(hazed(colour, shaded.from_eye));
 }
 
 @fragment

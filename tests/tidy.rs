@@ -81,9 +81,11 @@ const CLIENT: &[(&str, &[&str])] = &[
             "morph",
             "sight",
             "surface",
+            "texture",
         ],
     ),
-    ("render", &["camera", "drawing", "morph", "picture", "surface"]),
+    ("texture", &["background", "camera"]),
+    ("render", &["camera", "drawing", "morph", "picture", "surface", "texture"]),
     ("controls", &["camera"]),
     ("pick", &["drawing", "surface"]),
     ("overview", &["camera"]),
@@ -92,10 +94,10 @@ const CLIENT: &[(&str, &[&str])] = &[
         "viewer",
         &[
             "camera", "controls", "drawing", "encoding", "headless", "overview", "pick", "picture", "render",
-            "surface", "terrain",
+            "surface", "terrain", "texture",
         ],
     ),
-    ("web", &["encoding", "fetch", "render", "terrain", "viewer"]),
+    ("web", &["encoding", "fetch", "render", "terrain", "texture", "viewer"]),
     // The command line.
     ("command", &[]),
     // The made scene of the crate's own tests.

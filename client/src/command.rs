@@ -11,7 +11,8 @@ use diamantina_client::fetch::{self, FetchError};
 use diamantina_client::headless::{self, Flight, FlightPath, FrameLine, PictureReport};
 use diamantina_client::morph;
 use diamantina_client::sight::Sight;
-use diamantina_client::terrain::{self, Terrain, TerrainError};
+use diamantina_client::terrain::{self, Imagery, Terrain, TerrainError};
+use diamantina_client::texture::FADE_SECONDS;
 use diamantina_client::viewer::{self, Viewer};
 use glam::DVec3;
 use look::LookArgs;
@@ -104,6 +105,12 @@ struct ViewArgs {
     /// too, then count for what is seen of them
     #[arg(long, value_name = "NAME")]
     zone: Option<String>,
+    /// The imagery to lay on the terrain, or none [default: the scene's first, if it has any]
+    #[arg(long, value_name = "NAME|none")]
+    texture: Option<String>,
+    /// Memory for tiles of imagery, and as much again on the GPU
+    #[arg(long, default_value = "128", value_name = "MIB", value_parser = clap::value_parser!(u16).range(4..=1000))]
+    texture_memory: u16,
     /// Memory for decoded diamonds
     #[arg(long, default_value = "1024", value_name = "MIB")]
     memory: usize,
@@ -265,6 +272,13 @@ impl ViewArgs {
             },
             layers: self.layers.clone(),
             zone: self.zone.clone(),
+            imagery: match self.texture.as_deref() {
+                None => Imagery::First,
+                Some("none") => Imagery::None,
+                Some(name) => Imagery::Named(name.to_owned()),
+            },
+            texture_bytes: usize::from(self.texture_memory) << 20,
+            fade_seconds: if morph_seconds > 0.0 { FADE_SECONDS.min(morph_seconds) } else { 0.0 },
             ..terrain::Options::default()
         };
         Terrain::open(&self.url, options).map_err(|error| {
@@ -272,6 +286,7 @@ impl ViewArgs {
                 error,
                 TerrainError::Fetch(FetchError::Address { .. } | FetchError::Layer { .. })
                     | TerrainError::Zone { .. }
+                    | TerrainError::Texture { .. }
                     | TerrainError::Still
             );
             Failure(if wrong_use { 2 } else { 1 }, error.to_string())

@@ -487,7 +487,7 @@ fn unknown(layer: &Layer) -> Entry {
 }
 
 /// The box around a diamond, in the frame's metres.
-fn bounds(layer: &Layer, d: Diamond, entry: &Entry) -> Bounds {
+pub(crate) fn bounds(layer: &Layer, d: Diamond, entry: &Entry) -> Bounds {
     let [least, most] = layer.forest.bounds(d).map(|p| layer.position(p));
     let (low, high) = (layer.metres(entry.low), layer.metres(entry.high));
     Bounds {

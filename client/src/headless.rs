@@ -170,6 +170,10 @@ pub struct PictureReport {
     pub zone: Option<String>,
     /// Whether the eye was in it: then errors, those told here too, count for what is seen of them from the zone.
     pub zone_in_effect: bool,
+    /// The texture on the terrain.
+    pub texture: Option<String>,
+    /// Tiles of it that arrived.
+    pub texture_tiles: usize,
     /// Whether all that was wanted arrived.
     pub complete: bool,
     /// Milliseconds to draw the finished picture.
@@ -193,6 +197,7 @@ pub fn picture(
     terrain.set_exaggeration(look.exaggeration);
     let view = terrain.settle(&drawn, patience);
     let layers = &terrain.scene().layers;
+    offscreen.drape(view.drape.as_ref());
     offscreen.draw(layers, &drawn, &view.items, look)?;
     offscreen.read()?;
     // Everything is uploaded by now: this is what a frame costs.
@@ -236,6 +241,8 @@ fn report(
         largest_error_pixels: view.error_pixels,
         zone: terrain.zone().map(|zone| zone.name.clone()),
         zone_in_effect: view.stats.zone_in_effect,
+        texture: terrain.texture().map(|number| terrain.scene().textures[number].name.clone()),
+        texture_tiles: view.stats.texture_tiles,
         complete: view.complete,
         milliseconds_a_frame,
     }
@@ -507,6 +514,7 @@ pub fn fly(
         let mut look = *look;
         look.water.seconds += seconds;
         // Of this frame's version: another may have taken over, and lie elsewhere.
+        offscreen.drape(view.drape.as_ref());
         let stats = offscreen.draw(&terrain.scene().layers, &drawn, &view.items, &look)?;
         let picture = if flight.reads || flight.pictures.is_some() {
             Some(offscreen.read()?)

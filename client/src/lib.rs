@@ -46,6 +46,7 @@ pub mod render;
 pub mod sight;
 pub mod surface;
 pub mod terrain;
+pub mod texture;
 pub mod viewer;
 #[cfg(target_arch = "wasm32")]
 pub mod web;

@@ -15,6 +15,7 @@
 //! A scene that is replaced on the server while it is looked at is opened again by itself: see `reload`.
 
 mod decoders;
+mod imagery;
 mod reload;
 mod shown;
 
@@ -27,6 +28,7 @@ use crate::fetch::{self, Event, FetchError, Fetcher, ROOT_BYTES, Traffic, Want};
 use crate::morph::{self, Change, Moment, Morphs};
 use crate::sight::Sight;
 use crate::surface::{Points, Surface, Tin};
+use crate::texture::{Drape, Draping};
 use bytes::Bytes;
 use decoders::{Decoders, Job};
 use diamantina_protocol::diamond::Diamond;
@@ -34,6 +36,7 @@ use diamantina_protocol::message::{Layer, Scene, StreamAsk, StreamView};
 use diamantina_protocol::zone::{Mask, Zone};
 use foldhash::fast::RandomState;
 use glam::DVec3;
+pub use imagery::Imagery;
 use reload::Reload;
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -75,6 +78,12 @@ pub struct Options {
     pub layers: Option<Vec<String>>,
     /// The name of a zone: while the eye is in it, less is asked for where nothing is seen from there.
     pub zone: Option<String>,
+    /// What lies on the terrain.
+    pub imagery: Imagery,
+    /// Memory for tiles of imagery, in bytes; as much again on the GPU.
+    pub texture_bytes: usize,
+    /// Seconds in which a tile of imagery takes the place of a coarser one; 0: at once.
+    pub fade_seconds: f64,
     /// How to fetch, and in which encoding.
     pub fetch: fetch::Options,
 }
@@ -89,6 +98,9 @@ impl Default for Options {
             morph_seconds: 0.0,
             layers: None,
             zone: None,
+            imagery: Imagery::First,
+            texture_bytes: 128 << 20,
+            fade_seconds: 0.0,
             fetch: fetch::Options::default(),
         }
     }
@@ -134,6 +146,23 @@ pub enum TerrainError {
         /// The zones that there are.
         zones: Vec<String>,
     },
+    /// There is no such texture.
+    #[error(
+        "scene '{scene}' has no texture '{asked}'{}",
+        if .textures.is_empty() {
+            "; it has none at all: build it with --layer NAME=texture:PICTURE".to_owned()
+        } else {
+            format!(": it has {}", .textures.join(", "))
+        }
+    )]
+    Texture {
+        /// The scene.
+        scene: String,
+        /// The texture asked for.
+        asked: String,
+        /// The textures that there are.
+        textures: Vec<String>,
+    },
     /// Not a number of pixels.
     #[error("tolerance of {0} pixels: expected a number above 0")]
     Tolerance(f64),
@@ -164,6 +193,10 @@ pub struct Stats {
     pub resident: usize,
     /// Bytes of memory that they take.
     pub resident_bytes: usize,
+    /// Tiles of imagery in memory.
+    pub texture_tiles: usize,
+    /// Bytes that they take.
+    pub texture_bytes: usize,
     /// Pages of the index resident.
     pub pages: usize,
     /// Payloads that are being decoded or wait for their parents.
@@ -192,6 +225,8 @@ pub struct FrameView {
     /// The triangles to draw; together they cover whatever of the scene is in view, once all roots are
     /// there.
     pub items: Vec<DrawItem>,
+    /// The imagery on them, once some of it is there.
+    pub drape: Option<Drape>,
     /// The largest declared error of what is drawn, in pixels, as it looks from no nearer than the near plane;
     /// infinite while a layer lacks a root.
     pub error_pixels: f64,
@@ -199,7 +234,7 @@ pub struct FrameView {
     pub error_pixels_goal: f64,
     /// Whether all that the ideal cut wants is there.
     pub complete: bool,
-    /// Diamonds in motion, or about to be: the next frame looks different, even if nothing arrives. The error counts
+    /// Diamonds in motion, or about to be, and tiles of imagery: the next frame looks different, even if nothing arrives. The error counts
     /// them as not yet split.
     pub moving: usize,
     /// What has happened so far.
@@ -243,6 +278,7 @@ pub struct Terrain {
     planes: Option<[Plane; 5]>,
     stats: Stats,
     view: Option<ZoneView>,
+    draping: Option<Draping>,
 }
 
 /// What is seen from a zone.
@@ -327,6 +363,7 @@ impl Terrain {
             }
             None => None,
         };
+        let texture = options.imagery.find(&scene)?;
         let state = |layer: &Layer| LayerState {
             index: Index::new(layer.forest),
             ideal: Ideal::default(),
@@ -363,7 +400,9 @@ impl Terrain {
             planes: None,
             stats: Stats::default(),
             view,
+            draping: None,
         };
+        terrain.draping = texture.map(|number| terrain.drape(number)).transpose()?;
         terrain.show_only(shown);
         Ok(terrain)
     }
@@ -478,6 +517,7 @@ impl Terrain {
         let now = Moment::at(seconds);
         let started = Instant::now();
         self.take_decoded();
+        self.take_tiles();
         let arrived = self.take_fetched();
         // What comes of another version is still to come.
         let mut view = FrameView { complete: !self.is_leaving(), ..FrameView::default() };
@@ -518,7 +558,8 @@ impl Terrain {
         self.judge_streams(&arrived);
         let layers = self.layers.iter().enumerate();
         self.cache.want(layers.flat_map(|(number, state)| state.ideal.splits().map(move |d| (number, d))));
-        self.wish(wishes);
+        let imagery = self.imagery(camera, seconds, &mut view);
+        self.wish(wishes, imagery);
         self.note(&view, started);
         view.stats = self.stats;
         view
@@ -584,7 +625,8 @@ impl Terrain {
 
     /// Whether nothing more comes for now.
     fn is_stuck(&self) -> bool {
-        self.decoders.is_idle() && self.fetcher.is_stuck()
+        let is_idle = self.decoders.is_idle() && self.draping.as_ref().is_none_or(Draping::is_idle);
+        is_idle && self.fetcher.is_stuck()
     }
 
     fn take_decoded(&mut self) {
@@ -626,6 +668,18 @@ impl Terrain {
                     self.decode((layer, d), payload);
                     arrived.push((layer, d));
                 }
+                Event::Coverage(number, coverage) => {
+                    self.failed.remove(&fetch::Key::Coverage(number));
+                    if let Some(draping) = self.draping.as_mut().filter(|d| d.number() == number) {
+                        draping.set_coverage(coverage);
+                    }
+                }
+                Event::Tile(number, tile, picture) => {
+                    self.failed.remove(&fetch::Key::Tile(number, tile));
+                    if let Some(draping) = self.draping.as_mut().filter(|d| d.number() == number) {
+                        draping.take(tile, picture);
+                    }
+                }
                 Event::Failed(key, error) => {
                     tracing::warn!(%error, "given up for now");
                     self.failed.insert(key);
@@ -663,14 +717,16 @@ impl Terrain {
     }
 
     /// Asks for what the cut lacks: roots of all layers, pages, then payloads as they are urgent.
-    fn wish(&mut self, mut wishes: Vec<(usize, Wish)>) {
+    fn wish(&mut self, mut wishes: Vec<(usize, Wish)>, imagery: Vec<Want>) {
         for key in self.decoders.forget(|(number, d)| self.layers[number].ideal.contains(d)) {
             self.pending_bytes -= self.pending.remove(&key).unwrap_or(0);
         }
         if self.layers.len() > 1 {
             wishes.sort_by(|(_, a), (_, b)| a.order(b));
         }
-        let mut wants = Vec::with_capacity(wishes.len());
+        // They are few, and do not stand in one another's way.
+        let mut wants = imagery;
+        wants.reserve(wishes.len());
         let mut room = HELD_BYTES_MAX.saturating_sub(self.pending_bytes);
         let mut payloads = wishes.into_iter().peekable();
         while let Some((number, wish)) = payloads.next_if(|(_, wish)| wish.diamond.level() == 0) {

@@ -12,6 +12,7 @@ use crate::encoding::Encoding;
 use crate::fetch::{self, FetchError};
 use crate::render::{self, Look};
 use crate::terrain::{self, Terrain, TerrainError};
+use crate::texture::FADE_SECONDS;
 use crate::viewer::display::{Display, IDLE};
 use crate::viewer::{self, Ask, Viewer};
 use page::{Address, Page};
@@ -112,6 +113,9 @@ fn options(address: &Address) -> Result<terrain::Options, String> {
         tolerance_pixels,
         memory_bytes: MEMORY_BYTES,
         morph_seconds: if encoding == Encoding::Points { MORPH_SECONDS } else { 0.0 },
+        // Half of what a window takes: as much again is on the GPU.
+        texture_bytes: 64 << 20,
+        fade_seconds: FADE_SECONDS,
         layers: address.asked("layer").map(|names| names.split(',').map(str::to_owned).collect()),
         zone: address.asked("zone"),
         fetch: fetch::Options { encoding, ..fetch::Options::default() },

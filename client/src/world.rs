@@ -118,6 +118,7 @@ pub(crate) fn scene(layers: usize) -> Scene {
         frame: Frame { crs: None, vertical_unit: "metre".into() },
         layers: world()[..layers].iter().map(|built| built.layer.clone()).collect(),
         zones: Vec::new(),
+        textures: Vec::new(),
     }
 }
 

@@ -28,6 +28,9 @@ pub const LEVELS_MAX: u32 = 17;
 /// The most tiles of all levels: 250 thousand million texels. Their coverage takes 700 kB.
 pub const TILES_MAX: u64 = 5_600_000;
 
+/// The largest coverage as it is sent, in bytes: compressed, it is hardly larger than its bits.
+pub const COVERAGE_BYTES_MAX: usize = 704 << 10;
+
 /// The most textures of a scene.
 pub const TEXTURES_MAX: usize = 64;
 
@@ -319,12 +322,12 @@ mod tests {
     fn absurd_textures_are_refused() {
         for change in [
             |t: &mut Texture| t.size = [0, 4],
-            |t| t.size = [u32::MAX, 4],
-            |t| t.size = [1 << 22, 1 << 22],
-            |t| t.texel[1] = f64::NAN,
-            |t| t.texel[0] = -1.0,
-            |t| t.origin[0] = f64::INFINITY,
-            |t| t.format = "exe".to_owned(),
+            |t: &mut Texture| t.size = [u32::MAX, 4],
+            |t: &mut Texture| t.size = [1 << 22, 1 << 22],
+            |t: &mut Texture| t.texel[1] = f64::NAN,
+            |t: &mut Texture| t.texel[0] = -1.0,
+            |t: &mut Texture| t.origin[0] = f64::INFINITY,
+            |t: &mut Texture| t.format = "exe".to_owned(),
         ] {
             let mut texture = texture([1000, 1000]);
             change(&mut texture);
@@ -357,7 +360,7 @@ mod tests {
             let [across, up] = texture.grid(finest);
             let mut tiles = std::collections::BTreeSet::new();
             for index in chosen {
-                let number = index.index((across * up) as usize) as u32;
+                let number = u32::try_from(index.index((across * up) as usize)).unwrap();
                 let mut next = Some(Tile { level: finest, x: number % across, y: number / across });
                 while let Some(tile) = next {
                     coverage.insert(tile);

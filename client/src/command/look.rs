@@ -2,7 +2,7 @@
 
 use super::{Failure, numbers};
 use clap::{Args, ValueEnum};
-use diamantina_client::render::{self, Background, Colours, Look, Sun, Water};
+use diamantina_client::render::{self, Background, Colours, Imagery, Look, Sun, Water};
 use diamantina_protocol::message::Scene;
 use std::ops::RangeInclusive;
 
@@ -45,6 +45,9 @@ pub(super) struct LookArgs {
     /// The depth of water through which a third of green light comes [default: it fits the layer's extent, at most 12]
     #[arg(long, value_name = "METRES")]
     clarity: Option<f64>,
+    /// How much of the light on the ground imagery is shown in: 0 as it was taken, 1 as if it were the ground's own colour
+    #[arg(long, default_value_t = 0.5, value_name = "PART")]
+    texture_light: f32,
     /// The size of the mirrored picture as a part of the picture's: less is faster, and blurred
     #[arg(long, default_value_t = 1.0, value_name = "PART")]
     mirror_scale: f64,
@@ -83,6 +86,9 @@ impl LookArgs {
         if let Some(clarity) = self.clarity.filter(|metres| !(*metres > 0.0 && metres.is_finite())) {
             return refuse(format!("--clarity {clarity}: expected metres, above 0"));
         }
+        if !(0.0..=1.0).contains(&self.texture_light) {
+            return refuse(format!("--texture-light {}: expected a number from 0 to 1", self.texture_light));
+        }
         if !(self.mirror_scale > 0.0 && self.mirror_scale <= 1.0) {
             return refuse(format!(
                 "--mirror-scale {}: expected a number above 0, at most 1",
@@ -109,6 +115,7 @@ impl LookArgs {
             exaggeration: self.exaggeration,
             show_levels: self.show_levels,
             wireframe: self.wireframe,
+            imagery: Imagery { light: self.texture_light, ..look.imagery },
             water: Water {
                 reflecting: self.water == WaterName::Mirror,
                 waves: self.waves,

@@ -2,6 +2,7 @@
 
 use super::http::PAGE_BYTES_MAX;
 use diamantina_protocol::index::PageError;
+use diamantina_protocol::texture::Tile;
 use diamantina_protocol::wire::WireError;
 use std::time::Duration;
 
@@ -53,6 +54,21 @@ pub enum FetchError {
     /// A payload differs from what the index or its checksum tells.
     #[error("payload of the diamond at {0:?} is damaged: run `inspect --verify` at the server")]
     Damaged([u32; 2]),
+    /// The list of a texture's tiles is none.
+    #[error("the index of texture '{0}' is damaged: run `inspect --verify` at the server")]
+    Coverage(String),
+    /// A tile that is no picture of one.
+    #[error(
+        "tile {tile:?} of texture '{texture}' is damaged ({reason}): run `inspect --verify` at the server"
+    )]
+    Tile {
+        /// The texture.
+        texture: String,
+        /// The tile.
+        tile: Tile,
+        /// What is wrong with it.
+        reason: String,
+    },
     /// A batch that is none.
     #[error("batch: {0}")]
     Wire(#[from] WireError),

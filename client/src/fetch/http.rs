@@ -8,6 +8,7 @@ use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::{self, Entry};
 use diamantina_protocol::message::{self, Catalogue, FrameHeader, Layer, Scene, Status};
+use diamantina_protocol::texture::TEXTURES_MAX;
 use diamantina_protocol::zone::{self, Mask};
 use futures_util::StreamExt as _;
 use reqwest::{Client, Response, StatusCode, Url};
@@ -100,6 +101,15 @@ pub(crate) fn check(scene: &Scene) -> Result<(), String> {
         {
             return Err(format!("layer '{name}': numbers beyond all measure"));
         }
+    }
+    if scene.textures.len() > TEXTURES_MAX {
+        return Err(format!("{} textures, expected at most {TEXTURES_MAX}", scene.textures.len()));
+    }
+    for texture in &scene.textures {
+        if !message::is_name(&texture.name) {
+            return Err("a texture's name is none".into());
+        }
+        texture.check()?;
     }
     if scene.zones.len() > zone::ZONES_MAX {
         return Err(format!("{} zones, expected at most {}", scene.zones.len(), zone::ZONES_MAX));

@@ -50,6 +50,7 @@ use bytes::Bytes;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::Entry;
 use diamantina_protocol::message::{Scene, StreamAsk, scene_route};
+use diamantina_protocol::texture::{Coverage, Tile};
 use diamantina_protocol::zone::Mask;
 use foldhash::fast::RandomState;
 use http::{Counters, Http};
@@ -102,6 +103,10 @@ pub enum Key {
     Page(usize, u32),
     /// The payload of a layer's diamond.
     Diamond(usize, Diamond),
+    /// Which tiles a texture has.
+    Coverage(usize),
+    /// A tile of a texture.
+    Tile(usize, Tile),
 }
 
 /// Something to fetch.
@@ -120,6 +125,10 @@ pub enum Event {
     Page(usize, u32, Vec<(Diamond, Entry)>),
     /// The payload of a layer's diamond; empty where the server has none and the index did not tell.
     Payload(usize, Diamond, Bytes),
+    /// Which tiles a texture has.
+    Coverage(usize, Coverage),
+    /// The picture of a tile of a texture.
+    Tile(usize, Tile, Bytes),
     /// This has failed [`TRIES_MAX`] times in a row. It is tried again after [`REST`], if still wished for.
     Failed(Key, FetchError),
     /// The scene has another version now: open it again. Nothing more is fetched.

@@ -107,6 +107,8 @@ pub(super) fn weight(event: &Event) -> usize {
     match event {
         Event::Page(_, _, entries) => size_of_val(entries.as_slice()),
         Event::Payload(_, _, payload) => Bytes::len(payload),
+        Event::Tile(_, _, picture) => Bytes::len(picture),
+        Event::Coverage(_, coverage) => coverage.bytes().len(),
         Event::Failed(..) | Event::SceneChanged => 0,
     }
 }

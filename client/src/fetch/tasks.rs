@@ -3,6 +3,7 @@
 use super::batch::{Batch, Frames};
 use super::http::{Http, PAGE_BYTES_MAX, count, decode_page, good_payload, pause, shortened};
 use super::stream::weight;
+use super::unpack::unpack;
 use super::{Event, FetchError, Key, REST, TRIES_MAX, Want};
 use crate::background::within;
 use crate::encoding::Encoding;
@@ -10,6 +11,7 @@ use bytes::Bytes;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::message::{self, FrameHeader, Scene, StreamAsk};
+use diamantina_protocol::texture::{COVERAGE_BYTES_MAX, Coverage, TILE_BYTES_MAX, Tile, coverage_bytes};
 use foldhash::fast::RandomState;
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -57,6 +59,7 @@ pub(super) struct State {
 pub(super) struct Flight {
     pub(super) cancel: Arc<Notify>,
     is_page: bool,
+    is_tile: bool,
     /// The layer, if it is a stream.
     pub(super) stream: Option<usize>,
     /// Whether something of it has arrived.
@@ -77,6 +80,8 @@ enum Next {
 
 enum Request {
     Page(usize, u32),
+    Coverage(usize),
+    Tile(usize, Tile),
     Batch(usize, Vec<(Diamond, Option<u32>)>),
     Stream(usize, StreamAsk),
 }
@@ -141,19 +146,23 @@ impl Shared {
         let mut soonest: Option<Instant> = None;
         let mut page = None;
         let mut batch: Option<Batch> = None;
+        let mut imagery = None;
         let stream = state.streams.pop_front();
         let resting: Vec<bool> = (0..self.scene.layers.len()).map(|layer| state.rests(layer)).collect();
         let wishes = if stream.is_none() { state.wishes.as_slice() } else { &[] };
         // Batches share the line, so each further one delays those that are more urgent: half of the tasks keep it
         // busy. Pages are small, and it is their round trips that cost.
-        let batches = state.flights.values().filter(|f| !f.is_page && f.stream.is_none()).count();
-        let may_batch = batches < self.requests_max.div_ceil(2);
+        let is_batch = |f: &&Flight| !f.is_page && !f.is_tile && f.stream.is_none();
+        let half = self.requests_max.div_ceil(2);
+        let may_batch = state.flights.values().filter(is_batch).count() < half;
+        // Pictures share the line with heights.
+        let may_tile = state.flights.values().filter(|f| f.is_tile).count() < half;
         for want in wishes {
-            let (Key::Page(layer, _) | Key::Diamond(layer, _)) = want.key;
-            if resting[layer]
-                || state.flying.contains_key(&want.key)
-                || state.delivered.contains_key(&want.key)
-            {
+            let rests = match want.key {
+                Key::Page(layer, _) | Key::Diamond(layer, _) => resting[layer],
+                Key::Coverage(_) | Key::Tile(..) => !may_tile || imagery.is_some(),
+            };
+            if rests || state.flying.contains_key(&want.key) || state.delivered.contains_key(&want.key) {
                 continue;
             }
             if let Some(failure) = state.failures.get(&want.key).filter(|f| f.not_before > now) {
@@ -164,6 +173,8 @@ impl Shared {
                 Key::Page(layer, number) => {
                     page.get_or_insert((layer, number, batch.is_none()));
                 }
+                Key::Coverage(texture) => imagery = Some(Request::Coverage(texture)),
+                Key::Tile(texture, tile) => imagery = Some(Request::Tile(texture, tile)),
                 Key::Diamond(..) if !may_batch => {}
                 Key::Diamond(layer, d) => {
                     let batch = batch.get_or_insert_with(|| {
@@ -185,6 +196,10 @@ impl Shared {
                 Request::Page(layer, number)
             }
             (_, Some(batch), None) => Request::Batch(batch.layer, batch.wants),
+            (_, None, None) if imagery.is_some() => match imagery {
+                Some(request) => request,
+                None => return Next::Wait(soonest),
+            },
             _ => return Next::Wait(soonest),
         };
         if state.flights.is_empty() {
@@ -199,12 +214,21 @@ impl Shared {
             Request::Batch(layer, wants) => {
                 state.flying.extend(wants.iter().map(|(d, _)| (Key::Diamond(*layer, *d), id)));
             }
+            Request::Coverage(texture) => {
+                state.flying.insert(Key::Coverage(*texture), id);
+            }
+            Request::Tile(texture, tile) => {
+                state.flying.insert(Key::Tile(*texture, *tile), id);
+            }
             Request::Stream(..) => {}
         }
         let cancel = Arc::new(Notify::new());
         let is_page = matches!(request, Request::Page(..));
+        let is_tile = matches!(request, Request::Coverage(_) | Request::Tile(..));
         let stream = if let Request::Stream(layer, _) = &request { Some(*layer) } else { None };
-        state.flights.insert(id, Flight { cancel: Arc::clone(&cancel), is_page, stream, useful: false });
+        state
+            .flights
+            .insert(id, Flight { cancel: Arc::clone(&cancel), is_page, is_tile, stream, useful: false });
         Next::Fetch { id, cancel, request }
     }
 
@@ -217,6 +241,24 @@ impl Shared {
                 let body = self.http.whole(&route, PAGE_BYTES_MAX).await?;
                 let entries = decode_page(&layer_of.forest, *number, &body)?;
                 self.deliver(Key::Page(*layer, *number), Event::Page(*layer, *number, entries));
+                Ok(())
+            }
+            Request::Coverage(number) => {
+                let texture = &self.scene.textures[*number];
+                let Scene { name, version, .. } = &self.scene;
+                let route = message::index_route(name, version, &texture.name, 0);
+                let body = self.http.whole(&route, COVERAGE_BYTES_MAX).await?;
+                let damaged = || FetchError::Coverage(texture.name.clone());
+                let bytes = unpack(&body, coverage_bytes(texture)).ok_or_else(damaged)?;
+                let coverage = Coverage::decode(texture, &bytes).map_err(|_| damaged())?;
+                self.deliver(Key::Coverage(*number), Event::Coverage(*number, coverage));
+                Ok(())
+            }
+            Request::Tile(number, tile) => {
+                let texture = &self.scene.textures[*number].name;
+                let route = message::tile_route(&self.scene.name, &self.scene.version, texture, *tile);
+                let picture = self.http.whole(&route, TILE_BYTES_MAX).await?;
+                self.deliver(Key::Tile(*number, *tile), Event::Tile(*number, *tile, picture.into()));
                 Ok(())
             }
             Request::Batch(layer, wants) => {
@@ -272,7 +314,7 @@ impl Shared {
             flight.useful = true;
         }
         // Whether a payload is any good is not known before it is decoded.
-        if let Key::Page(..) = key {
+        if let Key::Page(..) | Key::Coverage(_) = key {
             state.failures.remove(&key);
         }
         state.serial += 1;

@@ -71,6 +71,7 @@ pub(super) struct FrameUniform {
     zenith: [f32; 4],
     options: [f32; 4],
     water: [f32; 4],
+    drape: [f32; 4],
     land: [[f32; 4]; 8],
     sea: [[f32; 4]; 4],
 }
@@ -159,7 +160,7 @@ fn top(colours: Colours, highest: f64) -> f64 {
 impl FrameUniform {
     /// The uniforms of a pass. `encode`: whether the target stores colours as they are, so that the
     /// shader must encode sRGB. `near`: the near plane, in metres.
-    pub(super) fn new(view: &View, look: &Look, near: f32, encode: bool) -> Self {
+    pub(super) fn new(view: &View, look: &Look, near: f32, encode: bool, anisotropy: u16) -> Self {
         let with = |v: DVec3, w: f32| v.as_vec3().extend(w).to_array();
         let [right, up, forward] = view.rays().map(|ray| with(ray, 0.0));
         let colour = |srgb: u32, w: f32| {
@@ -182,6 +183,7 @@ impl FrameUniform {
             zenith,
             options: [flag(encode), flag(look.show_levels), flag(look.colours == Colours::Flat), flag(even)],
             water: [r, g, b, single(view.lowest())],
+            drape: [look.imagery.light, look.imagery.opacity, f32::from(anisotropy), 0.0],
             land: if look.colours == Colours::Grey { ROCK } else { LAND }.map(|(at, srgb)| colour(srgb, at)),
             sea: SEA.map(|(at, srgb)| colour(srgb, at)),
         }
@@ -260,7 +262,7 @@ mod tests {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../shaders");
         for entry in std::fs::read_dir(folder).unwrap() {
             let name = entry.unwrap().file_name().into_string().unwrap();
-            let is_part = ["frame.wgsl", "surface.wgsl"].contains(&&*name);
+            let is_part = ["frame.wgsl", "surface.wgsl", "drape.wgsl"].contains(&&*name);
             assert!(is_part || SHADERS.iter().any(|(n, ..)| *n == name), "{name}");
         }
     }
@@ -284,8 +286,7 @@ mod tests {
 
     #[test]
     fn uniforms_have_the_layout_of_their_twins() {
-        let frame =
-            twin!(FrameUniform: clip_from_eye right up forward sun horizon zenith options water land sea);
+        let frame = twin!(FrameUniform: clip_from_eye right up forward sun horizon zenith options water drape land sea);
         assert_eq!(layout("Frame"), frame);
         let layer = twin!(LayerUniform: cell offset quantum up_offset height per_depth land_base per_height exaggeration is_water);
         assert_eq!(layout("Layer"), layer);

@@ -22,6 +22,8 @@ pub struct Look {
     pub wireframe: bool,
     /// How water looks.
     pub water: Water,
+    /// How imagery looks.
+    pub imagery: Imagery,
 }
 
 impl Default for Look {
@@ -35,6 +37,7 @@ impl Default for Look {
             show_levels: false,
             wireframe: false,
             water: Water::default(),
+            imagery: Imagery::default(),
         }
     }
 }
@@ -140,5 +143,21 @@ impl Default for Water {
             clarity: None,
             mirror_scale: 1.0,
         }
+    }
+}
+
+/// How imagery looks on terrain.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Imagery {
+    /// How much of the light on the ground it is shown in: 0 as it was taken, 1 as if it were the ground's own colour.
+    pub light: f32,
+    /// How much it hides of the terrain's colours, 0 to 1.
+    pub opacity: f32,
+}
+
+impl Default for Imagery {
+    /// Pictures have light and shadow of their own: some relief is added to it.
+    fn default() -> Self {
+        Self { light: 0.5, opacity: 1.0 }
     }
 }

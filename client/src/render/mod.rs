@@ -7,6 +7,7 @@
 //! | `view` | where a pass draws from: the eye, or its mirror image |
 //! | `pipelines` | how vertices become pixels |
 //! | `resident` | surfaces on the GPU, under a budget |
+//! | `drape` | imagery on terrain |
 //! | `water` | what is mirrored in water and seen through it |
 //! | `offscreen` | pictures without a window |
 //!
@@ -15,6 +16,7 @@
 //! reads it; irregular triangles have vertices and index lists of their own, and theirs. Nothing is used that WebGL2 lacks: no storage buffers, no base vertex, no
 //! indirect draws. Depth is reversed and infinite, positions are relative to the eye.
 
+mod drape;
 mod frame;
 mod look;
 #[cfg(not(target_arch = "wasm32"))]
@@ -27,14 +29,16 @@ mod water;
 #[cfg(test)]
 mod tests;
 
-pub use look::{Background, Colours, Look, Sun, Water};
+pub use look::{Background, Colours, Imagery, Look, Sun, Water};
 #[cfg(not(target_arch = "wasm32"))]
 pub use offscreen::Offscreen;
 
 use crate::camera::{Bounds, Camera, nearest_drawn};
 use crate::drawing::DrawItem;
 use crate::surface::Surface;
+use crate::texture::Drape;
 use diamantina_protocol::message::{self, Layer};
+use drape::{Drapes, Start};
 use frame::{FrameUniform, LayerUniform, Reference, single};
 use pipelines::{Kind, Mode, Pipelines, Target, sky_pipeline, terrain_pipelines};
 use resident::{Residents, Triangles};
@@ -59,12 +63,19 @@ pub struct Options {
     pub samples: u32,
     /// Bytes of GPU memory for surfaces; those that a frame draws are kept whatever they take.
     pub budget_bytes: u64,
+    /// Steps that imagery seen at a slant is sampled in, 1 to 16: more is sharper.
+    pub anisotropy: u16,
 }
 
 impl Default for Options {
     /// Four samples, 512 MiB: about eight thousand diamonds of 64 segments.
     fn default() -> Self {
-        Self { format: wgpu::TextureFormat::Rgba8UnormSrgb, samples: 4, budget_bytes: 512 << 20 }
+        Self {
+            format: wgpu::TextureFormat::Rgba8UnormSrgb,
+            samples: 4,
+            budget_bytes: 512 << 20,
+            anisotropy: 4,
+        }
     }
 }
 
@@ -155,6 +166,12 @@ pub(crate) async fn device(
     Ok((adapter, device, queue))
 }
 
+/// What suits an adapter of what was asked for: one in software takes its time for each step.
+pub(crate) fn fit(options: &Options, adapter: &wgpu::Adapter) -> Options {
+    let is_software = adapter.get_info().device_type == wgpu::DeviceType::Cpu;
+    Options { anisotropy: if is_software { 1 } else { options.anisotropy }, ..*options }
+}
+
 /// A diamond's place, as the vertex shader takes it.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
@@ -165,6 +182,9 @@ struct Instance {
     /// The moment to draw, and ticks that a motion takes; 0 and 1 where nothing moves.
     now: i32,
     duration: i32,
+    /// The first tile of imagery, and where in it the eye is and what a metre is.
+    tile: u32,
+    drape: [f32; 4],
 }
 
 /// A draw: an item of the frame that is in view.
@@ -190,6 +210,9 @@ pub struct Renderer {
     /// Of the uniforms of a pass, and of a layer.
     groups: [wgpu::BindGroupLayout; 2],
     sky: wgpu::RenderPipeline,
+    drapes: Drapes,
+    /// Bytes of imagery uploaded since the last frame.
+    draped_bytes: u64,
     /// There but while a frame is drawn.
     lens: Option<Lens>,
     water: Option<WaterPasses>,
@@ -236,10 +259,18 @@ impl Renderer {
             layout("layer", true, size_of::<LayerUniform>()),
         ];
         let target = Target { format: options.format, samples: options.samples };
+        let drapes = Drapes::new(&device, options.anisotropy);
         Self {
             residents: Residents::new(options.budget_bytes),
             options: *options,
-            filled: terrain_pipelines(&device, target, &groups.each_ref(), Mode::Filled),
+            filled: terrain_pipelines(
+                &device,
+                target,
+                &[&groups[0], &groups[1], drapes.layout()],
+                Mode::Filled,
+            ),
+            drapes,
+            draped_bytes: 0,
             wires: None,
             sky: sky_pipeline(&device, target, &groups[0]),
             lens: None,
@@ -279,8 +310,10 @@ impl Renderer {
         let uploaded_bytes = self.residents.start_frame(&self.device, layers, items, look.wireframe);
         let mut stats =
             FrameStats { uploaded_bytes, gpu_bytes: self.residents.bytes(), ..Default::default() };
+        stats.uploaded_bytes += std::mem::take(&mut self.draped_bytes);
+        stats.gpu_bytes += self.drapes.bytes();
         if look.wireframe && self.wires.is_none() {
-            let made = |mode| terrain_pipelines(&self.device, self.target(), &self.groups.each_ref(), mode);
+            let made = |mode| terrain_pipelines(&self.device, self.target(), &self.terrain_groups(), mode);
             self.wires = Some([made(Mode::Behind), made(Mode::Lines)]);
         }
         let attachments = match self.attachments.take() {
@@ -310,6 +343,7 @@ impl Renderer {
         }
         {
             let mut pass = begin_pass(&mut encoder, &attachments, target, look, self.options.format);
+            pass.set_bind_group(2, self.drapes.group(), &[]);
             match self.wires.as_ref().filter(|_| look.wireframe) {
                 None => self.draw_surfaces(&mut pass, &lens, land, 0, &self.filled, false, &mut stats),
                 Some([behind, lines]) => {
@@ -327,6 +361,16 @@ impl Renderer {
         (self.lens, self.water, self.attachments) = (Some(lens), water, Some(attachments));
         self.queue.submit([encoder.finish()]);
         stats
+    }
+
+    /// Lays imagery on the terrain in the frames from now on, or none: uploads tiles not seen before.
+    pub fn drape(&mut self, drape: Option<&Drape>) {
+        self.draped_bytes += self.drapes.show(&self.device, &self.queue, drape);
+    }
+
+    /// The groups that terrain's pipelines take.
+    fn terrain_groups(&self) -> [&wgpu::BindGroupLayout; 3] {
+        [&self.groups[0], &self.groups[1], self.drapes.layout()]
     }
 
     fn target(&self) -> Target {
@@ -470,7 +514,7 @@ impl Lens {
         let nearest = draws.iter().map(|d| d.distance).fold(NEAR_MAX, f64::min);
         // A little before the nearest box: rounding must not cut it.
         let near = single((0.9 * nearest).max(nearest_drawn(layers.iter().flat_map(|layer| layer.cell))));
-        let frame = FrameUniform::new(view, look, near, encode);
+        let frame = FrameUniform::new(view, look, near, encode, renderer.options.anisotropy);
         queue.write_buffer(&self.frame, 0, bytemuck::bytes_of(&frame));
 
         let references: Vec<_> =
@@ -501,12 +545,17 @@ impl Lens {
                     .map(|step| i32::try_from(step).unwrap_or(0));
                 let moving = draw.item.moving.as_ref();
                 let (now, duration) = moving.map_or((0, 1), |m| (m.now.ticks(), m.motion.duration()));
+                let is_terrain = layers[layer].kind == message::Kind::Terrain;
+                let start =
+                    if is_terrain { renderer.drapes.start(&draw.bounds, view) } else { Start::default() };
                 Instance {
                     origin: references[layer].relative(local.origin),
                     axes: [ux, uy, vx, vy],
                     level: i32::try_from(draw.item.diamond.level()).unwrap_or(0),
                     now,
                     duration,
+                    tile: start.node,
+                    drape: start.place,
                 }
             })
             .collect();

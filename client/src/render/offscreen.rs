@@ -1,9 +1,10 @@
 //! Pictures without a window.
 
-use super::{BACKENDS, FrameStats, Look, Options, RenderError, Renderer, device, instance};
+use super::{BACKENDS, FrameStats, Look, Options, RenderError, Renderer, device, fit, instance};
 use crate::camera::Camera;
 use crate::drawing::DrawItem;
 use crate::picture::Picture;
+use crate::texture::Drape;
 use diamantina_protocol::message::Layer;
 
 /// A renderer with a target of its own, as large as the last picture.
@@ -20,9 +21,14 @@ impl Offscreen {
     /// When there is no adapter, or it gives no device.
     pub fn new(options: &Options) -> Result<Self, RenderError> {
         let found = async { device(&instance(BACKENDS).await, None, "offscreen").await };
-        let (_, device, queue) = pollster::block_on(found)?;
-        let options = Options { format: wgpu::TextureFormat::Rgba8UnormSrgb, ..*options };
+        let (adapter, device, queue) = pollster::block_on(found)?;
+        let options = Options { format: wgpu::TextureFormat::Rgba8UnormSrgb, ..fit(options, &adapter) };
         Ok(Self { renderer: Renderer::new(device, queue, &options), target: None })
+    }
+
+    /// See [`Renderer::drape`].
+    pub fn drape(&mut self, drape: Option<&Drape>) {
+        self.renderer.drape(drape);
     }
 
     /// Draws a frame of `camera.size` pixels. See [`Renderer::draw`].

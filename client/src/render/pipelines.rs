@@ -9,6 +9,7 @@ use crate::surface::Corner;
 pub(super) const TERRAIN_WGSL: &str = concat!(
     include_str!("../../../shaders/frame.wgsl"),
     include_str!("../../../shaders/surface.wgsl"),
+    include_str!("../../../shaders/drape.wgsl"),
     include_str!("../../../shaders/terrain.wgsl")
 );
 /// The shaders of water: its surface is one like that of terrain.
@@ -57,7 +58,7 @@ pub(super) type Pipelines = [wgpu::RenderPipeline; 3];
 const PLACE: &[wgpu::VertexAttribute] = &wgpu::vertex_attr_array![0 => Uint16x2];
 const POINT: &[wgpu::VertexAttribute] = &wgpu::vertex_attr_array![1 => Sint32, 2 => Snorm16x2];
 const INSTANCE: &[wgpu::VertexAttribute] =
-    &wgpu::vertex_attr_array![3 => Sint32x2, 4 => Sint32x4, 5 => Sint32x3];
+    &wgpu::vertex_attr_array![3 => Sint32x2, 4 => Sint32x4, 5 => Sint32x4, 10 => Float32x4];
 pub(super) const RECORD: &[wgpu::VertexAttribute] =
     &wgpu::vertex_attr_array![6 => Float32x2, 7 => Snorm16x2, 8 => Snorm16x2, 9 => Sint32];
 

@@ -48,6 +48,7 @@ const PLAIN: Look = Look {
         clarity: None,
         mirror_scale: 1.0,
     },
+    imagery: Imagery { light: 0.0, opacity: 1.0 },
 };
 
 /// A layer with all surfaces of its forest, decoded from payloads as a client does.
@@ -467,7 +468,14 @@ fn other_bodies_are_grey() {
         let proj4 = proj4.map(str::to_owned);
         let crs = Crs { name: String::new(), proj4, origin: [0.0; 2], per_metre: [1.0; 2] };
         let frame = Frame { crs: Some(crs), vertical_unit: "metre".into() };
-        Look::of(&Scene { name: "s".into(), version: "v".into(), frame, layers: vec![], zones: vec![] })
+        Look::of(&Scene {
+            name: "s".into(),
+            version: "v".into(),
+            frame,
+            layers: vec![],
+            zones: vec![],
+            textures: vec![],
+        })
     };
     for earth in [None, Some("+proj=utm +zone=11 +datum=WGS84"), Some("+proj=merc +a=6378137 +b=6378137")] {
         assert_eq!(look(earth), Look::default());

@@ -32,6 +32,11 @@ impl View {
         self.mirror.map_or(eye, |height| DVec3::new(eye.x, eye.y, 2.0 * height - eye.z))
     }
 
+    /// Pixels of the middle of the picture for each radian.
+    pub(super) fn pixels_per_radian(&self) -> f64 {
+        self.camera.pixels_per_radian()
+    }
+
     /// What the sides of a view are multiplied by.
     fn flip(&self) -> DVec3 {
         if self.mirror.is_some() { DVec3::new(1.0, 1.0, -1.0) } else { DVec3::ONE }

@@ -182,7 +182,7 @@ impl WaterPasses {
             ..Default::default()
         });
         let [frame, layer] = &renderer.groups;
-        let terrain = |mode| terrain_pipelines(device, TARGET, &[frame, layer], mode);
+        let terrain = |mode| terrain_pipelines(device, TARGET, &renderer.terrain_groups(), mode);
         Self {
             surfaces: terrain_pipelines(device, renderer.target(), &[frame, layer, &layout], Mode::Water),
             mirrored: terrain(Mode::Mirrored),
@@ -353,6 +353,7 @@ fn draw_sheet(
         }),
         ..Default::default()
     });
+    pass.set_bind_group(2, renderer.drapes.group(), &[]);
     renderer.draw_surfaces(&mut pass, lens, land, 0, pipelines, false, stats);
     lens.draw_sky(&mut pass, sky, look);
 }

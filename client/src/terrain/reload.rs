@@ -4,7 +4,7 @@
 //! loaded, beside what is drawn; once it is as exact, it takes over, in one frame. While both are there, they take
 //! twice the memory. The same way another encoding of the same version is gone over to, or another zone.
 
-use super::{FrameView, Options, Terrain, TerrainError};
+use super::{FrameView, Imagery, Options, Terrain, TerrainError};
 use crate::background::aside;
 use crate::camera::Camera;
 use crate::encoding::Encoding;
@@ -30,9 +30,13 @@ fn open(url: &str, options: &Options) -> Reload {
     // The other version may have other layers.
     let (url, options) = (url.to_owned(), Options { layers: None, ..options.clone() });
     let started = aside("diamantina-reload", async move {
-        let opened = match Terrain::connect(&url, options.clone()).await {
-            Err(TerrainError::Zone { .. }) => Terrain::connect(&url, Options { zone: None, ..options }).await,
-            other => other,
+        let mut options = options;
+        let opened = loop {
+            match Terrain::connect(&url, options.clone()).await {
+                Err(TerrainError::Zone { .. }) if options.zone.is_some() => options.zone = None,
+                Err(TerrainError::Texture { .. }) => options.imagery = Imagery::First,
+                other => break other,
+            }
         };
         // Nobody waits for it any more when the terrain is dropped.
         let _ = sender.send(opened);
@@ -108,7 +112,9 @@ impl Terrain {
             next.show_only(self.options.layers.clone());
             let view = next.draw_at(camera, seconds);
             let is_as_exact = view.error_pixels <= self.error_pixels || view.complete || next.is_stuck();
-            if view.error_pixels.is_finite() && is_as_exact {
+            // Nor is imagery missing for a while.
+            let is_draped = view.drape.is_some() || next.draping.is_none() || next.is_stuck();
+            if view.error_pixels.is_finite() && is_as_exact && is_draped {
                 ready = Some(view);
             }
         }

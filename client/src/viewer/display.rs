@@ -53,7 +53,7 @@ impl Display {
         let context = egui::Context::default();
         let (view, side) = (egui::ViewportId::ROOT, usize::try_from(limit).ok());
         let input = egui_winit::State::new(context, view, &window, None, None, side);
-        let options = render::Options { format: configuration.format, ..*options };
+        let options = render::Options { format: configuration.format, ..render::fit(options, &adapter) };
         let renderer = Renderer::new(device, queue, &options);
         Ok(Self {
             window,
@@ -144,6 +144,7 @@ impl Display {
         if let Some(texture) = self.texture() {
             let view = texture.texture.create_view(&wgpu::TextureViewDescriptor::default());
             let layers = &viewer.terrain().scene().layers;
+            self.renderer.drape(viewer.drape());
             let drawn = self.renderer.draw(layers, viewer.camera(), &viewer.items(), viewer.look(), &view);
             if with_panel {
                 self.paint(&view, &shapes, output.pixels_per_point);

@@ -33,6 +33,7 @@ use crate::overview;
 use crate::pick::{Hit, Picker, Ray};
 use crate::render::{FrameStats, Look};
 use crate::terrain::{FrameView, Terrain};
+use crate::texture::Drape;
 use bookmarks::Bookmarks;
 use diamantina_protocol::message::Kind;
 use egui::{Event, Key, Modifiers, PointerButton, Sense, Ui};
@@ -168,6 +169,12 @@ impl Viewer {
     pub fn items(&self) -> Vec<DrawItem> {
         let items = self.frozen.as_ref().unwrap_or(&self.frame.items);
         items.iter().filter(|item| self.terrain.is_shown(item.layer)).cloned().collect()
+    }
+
+    /// The imagery on what is drawn.
+    #[must_use]
+    pub fn drape(&self) -> Option<&Drape> {
+        self.frame.drape.as_ref()
     }
 
     /// What is asked for since the last call.

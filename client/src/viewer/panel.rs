@@ -116,6 +116,7 @@ fn view(viewer: &mut Viewer, ui: &mut Ui) {
         viewer.set_exaggeration(exaggeration);
     }
     streaming(viewer, ui);
+    imagery(viewer, ui);
     let name = |colours: Colours| match colours {
         Colours::Auto => "as the heights suggest",
         Colours::Terrain => "terrain",
@@ -134,6 +135,32 @@ fn view(viewer: &mut Viewer, ui: &mut Ui) {
     let mut is_frozen = viewer.frozen.is_some();
     if ui.checkbox(&mut is_frozen, "freeze what is drawn").changed() {
         viewer.frozen = is_frozen.then(|| viewer.frame.items.clone());
+    }
+}
+
+/// Which imagery lies on the terrain, where there is any.
+fn imagery(viewer: &mut Viewer, ui: &mut Ui) {
+    let textures = &viewer.terrain.scene().textures;
+    if textures.is_empty() {
+        return;
+    }
+    let names: Vec<String> = textures.iter().map(|texture| texture.name.clone()).collect();
+    let before = viewer.terrain.texture();
+    let mut chosen = before;
+    let text = chosen.map_or("none", |number| &names[number]);
+    ComboBox::from_label("imagery").selected_text(text).show_ui(ui, |ui| {
+        ui.selectable_value(&mut chosen, None, "none");
+        for (number, name) in names.iter().enumerate() {
+            ui.selectable_value(&mut chosen, Some(number), name);
+        }
+    });
+    if chosen != before {
+        viewer.terrain.set_texture(chosen);
+    }
+    if chosen.is_some() {
+        let look = &mut viewer.look.imagery;
+        ui.add(Slider::new(&mut look.opacity, 0.0..=1.0).text("imagery"));
+        ui.add(Slider::new(&mut look.light, 0.0..=1.0).text("light on it"));
     }
 }
 
@@ -227,6 +254,9 @@ fn figures(viewer: &Viewer, ui: &mut Ui) {
     row("received", format!("{:.2} MB", stats.traffic.bytes as f64 / 1e6));
     row("requests", format!("{} in {} round trips", stats.traffic.requests, stats.traffic.round_trips));
     row("memory", format!("{:.0} MB", stats.resident_bytes as f64 / 1e6));
+    if stats.texture_tiles > 0 {
+        row("imagery", format!("{} tiles, {:.0} MB", stats.texture_tiles, stats.texture_bytes as f64 / 1e6));
+    }
     row("graphics memory", format!("{:.0} MB", viewer.drawn.gpu_bytes as f64 / 1e6));
     let history = &viewer.history;
     plot(ui, "ms a frame", &history.milliseconds);

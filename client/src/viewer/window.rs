@@ -100,6 +100,7 @@ impl Shown {
     fn photograph(&self, path: &Path) -> Result<(), headless::HeadlessError> {
         let mut offscreen = Offscreen::new(&self.options)?;
         let layers = &self.viewer.terrain().scene().layers;
+        offscreen.drape(self.viewer.drape());
         offscreen.draw(layers, self.viewer.camera(), &self.viewer.items(), self.viewer.look())?;
         let picture: picture::Picture = offscreen.read()?;
         headless::save(&picture, path)

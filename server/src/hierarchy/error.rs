@@ -44,7 +44,7 @@ pub enum BuildError {
         /// Its name.
         texture: String,
         /// What it was.
-        error: TextureError,
+        error: Box<TextureError>,
     },
     /// More than a scene may have.
     #[error("{0} textures, expected at most {TEXTURES_MAX}: build several scenes")]

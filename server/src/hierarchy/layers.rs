@@ -147,7 +147,7 @@ pub(super) fn check_textures(
         if is_taken || !is_name(texture.name) || texture.name == "zones" {
             return Err(BuildError::LayerName(texture.name.to_owned()));
         }
-        let failed = |error| BuildError::Texture { texture: texture.name.to_owned(), error };
+        let failed = |error| BuildError::Texture { texture: texture.name.to_owned(), error: Box::new(error) };
         describe(*texture, options.texture_quality).map_err(failed)?;
     }
     Ok(())

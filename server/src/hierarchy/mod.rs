@@ -280,7 +280,7 @@ fn build_textures(
     let mut built = Vec::with_capacity(sources.len());
     for (number, source) in (0u8..).zip(sources) {
         work.progress.of(Some(source.name));
-        let failed = |error| BuildError::Texture { texture: source.name.to_owned(), error };
+        let failed = |error| BuildError::Texture { texture: source.name.to_owned(), error: Box::new(error) };
         let texture = texture::build(*source, number, options.texture_quality, writer, work.progress)
             .map_err(failed)?;
         built.push(texture.ok_or_else(|| work.interrupted())?);

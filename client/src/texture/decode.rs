@@ -1,0 +1,187 @@
+//! Pictures of tiles → texels, beside the frames.
+//!
+//! Natively in Rust, on threads of its own; in a browser by the browser, which does it on its own threads and has the
+//! program for it already.
+
+use crate::background::Background;
+use bytes::Bytes;
+use diamantina_protocol::texture::{SIDE, Tile};
+use std::sync::{OnceLock, mpsc};
+
+/// The texels of a tile: red, green, blue and opacity, rows from the north, sRGB; colours are multiplied by the opacity, as
+/// light, so that the texels' mean is that of what they show.
+#[derive(Debug, PartialEq, Eq)]
+pub struct TileImage {
+    texels: Vec<u8>,
+}
+
+impl TileImage {
+    /// Texels as they are in pictures: as many as a tile has.
+    ///
+    /// # Errors
+    /// When there are more or fewer, in words.
+    pub fn new(mut texels: Vec<u8>) -> Result<Self, String> {
+        if texels.len() != super::TILE_BYTES {
+            return Err(format!("{} bytes of texels, expected {}", texels.len(), super::TILE_BYTES));
+        }
+        texels.as_chunks_mut::<4>().0.iter_mut().for_each(multiply);
+        Ok(Self { texels })
+    }
+
+    /// The bytes of the texels.
+    #[must_use]
+    pub fn texels(&self) -> &[u8] {
+        &self.texels
+    }
+}
+
+/// Multiplies a colour by its opacity, as light.
+fn multiply(texel: &mut [u8; 4]) {
+    let opacity = texel[3];
+    if opacity == u8::MAX {
+        return;
+    }
+    if opacity == 0 {
+        *texel = [0; 4];
+        return;
+    }
+    static LIGHT: OnceLock<[f32; 256]> = OnceLock::new();
+    let light = LIGHT.get_or_init(|| {
+        std::array::from_fn(|srgb| {
+            let value = srgb as f32 / 255.0;
+            if value <= 0.040_45 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
+        })
+    });
+    for colour in &mut texel[..3] {
+        let less = light[usize::from(*colour)] * f32::from(opacity) / 255.0;
+        let encoded = if less <= 0.003_130_8 { 12.92 * less } else { 1.055 * less.powf(1.0 / 2.4) - 0.055 };
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "from 0 to 255")]
+        let byte = (encoded * 255.0).round() as u8;
+        *colour = byte;
+    }
+}
+
+type Decoded = (Tile, Result<TileImage, String>);
+
+/// Decodes in the background.
+#[derive(Debug)]
+pub(super) struct Decoder {
+    background: Background,
+    sender: mpsc::Sender<Decoded>,
+    decoded: mpsc::Receiver<Decoded>,
+}
+
+impl Decoder {
+    pub(super) fn start() -> std::io::Result<Self> {
+        let (sender, decoded) = mpsc::channel();
+        Ok(Self { background: Background::start("diamantina-tiles")?, sender, decoded })
+    }
+
+    pub(super) fn submit(&self, tile: Tile, picture: Bytes) {
+        let sender = self.sender.clone();
+        self.background.spawn(async move {
+            let image = driver::texels(&picture).await.and_then(TileImage::new);
+            // Nobody waits for it any more when the texture is dropped.
+            let _ = sender.send((tile, image));
+        });
+    }
+
+    pub(super) fn poll(&self) -> Option<Decoded> {
+        self.decoded.try_recv().ok()
+    }
+}
+
+#[cfg(not(target_arch = "wasm32"))]
+mod driver {
+    use super::SIDE;
+
+    /// Red, green, blue and opacity of a picture of a tile's size, which may be hostile.
+    #[allow(clippy::unused_async, reason = "the browser's is")]
+    pub(super) async fn texels(picture: &[u8]) -> Result<Vec<u8>, String> {
+        let mut decoder =
+            image_webp::WebPDecoder::new(std::io::Cursor::new(picture)).map_err(|e| e.to_string())?;
+        if decoder.dimensions() != (SIDE, SIDE) || decoder.is_animated() {
+            let (width, height) = decoder.dimensions();
+            return Err(format!("{width} x {height} texels, expected {SIDE} x {SIDE}"));
+        }
+        decoder.set_memory_limit(16 << 20);
+        let bytes = decoder.output_buffer_size().ok_or("too many texels")?;
+        let mut texels = vec![0; bytes];
+        decoder.read_image(&mut texels).map_err(|e| e.to_string())?;
+        if decoder.has_alpha() {
+            return Ok(texels);
+        }
+        let (colours, _) = texels.as_chunks::<3>();
+        Ok(colours.iter().flat_map(|[r, g, b]| [*r, *g, *b, u8::MAX]).collect())
+    }
+}
+
+#[cfg(target_arch = "wasm32")]
+mod driver {
+    use super::SIDE;
+    use wasm_bindgen::JsCast;
+    use wasm_bindgen_futures::JsFuture;
+    use web_sys::{Blob, BlobPropertyBag, ImageBitmap, OffscreenCanvas, OffscreenCanvasRenderingContext2d};
+
+    /// Red, green, blue and opacity of a picture of a tile's size, which may be hostile.
+    pub(super) async fn texels(picture: &[u8]) -> Result<Vec<u8>, String> {
+        draw(picture).await.map_err(|error| format!("{error:?}"))
+    }
+
+    async fn draw(picture: &[u8]) -> Result<Vec<u8>, wasm_bindgen::JsValue> {
+        let parts = js_sys::Array::of1(&js_sys::Uint8Array::from(picture));
+        let kind = BlobPropertyBag::new();
+        kind.set_type("image/webp");
+        let blob = Blob::new_with_u8_array_sequence_and_options(&parts, &kind)?;
+        let window = js_sys::global().unchecked_into::<web_sys::Window>();
+        let bitmap: ImageBitmap =
+            JsFuture::from(window.create_image_bitmap_with_blob(&blob)?).await?.dyn_into()?;
+        if [bitmap.width(), bitmap.height()] != [SIDE; 2] {
+            return Err("a picture of another size".into());
+        }
+        let canvas = OffscreenCanvas::new(SIDE, SIDE)?;
+        let context: OffscreenCanvasRenderingContext2d =
+            canvas.get_context("2d")?.ok_or("no canvas to draw on")?.dyn_into()?;
+        context.draw_image_with_image_bitmap(&bitmap, 0.0, 0.0)?;
+        bitmap.close();
+        let data = context.get_image_data(0.0, 0.0, f64::from(SIDE), f64::from(SIDE))?;
+        Ok(data.data().0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_no_tile_is_refused() {
+        let decode = |bytes: &[u8]| pollster::block_on(driver::texels(bytes));
+        assert!(decode(b"").is_err());
+        assert!(decode(b"RIFF\x04\x00\x00\x00WEBP").is_err());
+        let picture = |side: u32| {
+            let mut bytes = Vec::new();
+            let texels: Vec<u8> = (0..4 * side * side).map(|i| (i * 7 % 251) as u8).collect();
+            let encoder = image_webp::WebPEncoder::new(&mut bytes);
+            encoder.encode(&texels, side, side, image_webp::ColorType::Rgba8).unwrap();
+            (bytes, texels)
+        };
+        let (bytes, texels) = picture(SIDE);
+        assert_eq!(decode(&bytes).unwrap(), texels);
+        assert!(decode(&bytes[..bytes.len() / 2]).is_err());
+        assert!(decode(&picture(SIDE / 2).0).is_err());
+        assert!(TileImage::new(vec![0; 100]).is_err());
+    }
+
+    #[test]
+    fn colours_are_multiplied_as_light() {
+        let mut texel = [255, 188, 0, 128];
+        multiply(&mut texel);
+        // Half the light of white is 188; half of that 138.
+        assert_eq!(texel, [188, 138, 0, 128]);
+        for (opacity, expected) in [(0, [0; 4]), (255, [9, 8, 7, 255])] {
+            let mut texel = [9, 8, 7, opacity];
+            multiply(&mut texel);
+            assert_eq!(texel, expected);
+        }
+    }
+}
