@@ -51,6 +51,7 @@ mod service;
 mod stream;
 /// A scene built again while it is served: nobody is refused, and a bad version never replaces a good one.
 mod swap;
+mod textures;
 /// The house: who may import whom, how long a file may be.
 mod tidy;
 /// Laws 2, 3, 6 and 7 for triangles: borders fit, declared errors hold, killed builds go on, and are served.

@@ -272,11 +272,7 @@ impl ViewArgs {
             },
             layers: self.layers.clone(),
             zone: self.zone.clone(),
-            imagery: match self.texture.as_deref() {
-                None => Imagery::First,
-                Some("none") => Imagery::None,
-                Some(name) => Imagery::Named(name.to_owned()),
-            },
+            imagery: Imagery::asked(self.texture.clone()),
             texture_bytes: usize::from(self.texture_memory) << 20,
             fade_seconds: if morph_seconds > 0.0 { FADE_SECONDS.min(morph_seconds) } else { 0.0 },
             ..terrain::Options::default()

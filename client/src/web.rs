@@ -11,7 +11,7 @@ mod page;
 use crate::encoding::Encoding;
 use crate::fetch::{self, FetchError};
 use crate::render::{self, Look};
-use crate::terrain::{self, Terrain, TerrainError};
+use crate::terrain::{self, Imagery, Terrain, TerrainError};
 use crate::texture::FADE_SECONDS;
 use crate::viewer::display::{Display, IDLE};
 use crate::viewer::{self, Ask, Viewer};
@@ -118,6 +118,7 @@ fn options(address: &Address) -> Result<terrain::Options, String> {
         fade_seconds: FADE_SECONDS,
         layers: address.asked("layer").map(|names| names.split(',').map(str::to_owned).collect()),
         zone: address.asked("zone"),
+        imagery: Imagery::asked(address.asked("texture")),
         fetch: fetch::Options { encoding, ..fetch::Options::default() },
         ..terrain::Options::default()
     })

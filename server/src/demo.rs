@@ -66,6 +66,9 @@ pub fn run(folder: &Path, samples: u32, listen: SocketAddr, headless: bool) -> R
     let (dem, store, picture) = (folder.join("sample.tif"), folder.join("sample"), folder.join("sample.png"));
     say(&format!("Making a landscape of {samples} x {samples} samples: {}", dem.display()));
     sample::write(&dem, samples).map_err(DemoError::Sample)?;
+    let photo = folder.join("photo.tif");
+    say(&format!("Making a picture of it from the air: {}", photo.display()));
+    sample::write_imagery(&photo, samples).map_err(DemoError::Sample)?;
     say(&format!("Building the store: {}", store.display()));
     let source = ingest::open(std::slice::from_ref(&dem), &ingest::Options::default())?;
     let options = Options { max_error: 0.5, memory: 1 << 30, ..Options::new("sample") };

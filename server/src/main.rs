@@ -472,6 +472,11 @@ fn build(args: &BuildArgs) -> Result<(), Failure> {
             writeln!(out, "{}", serde_json::to_string_pretty(&estimates)?)?;
         } else {
             print::estimates(&mut out, &args.output, &estimates)?;
+            for source in layers.textures() {
+                let texture = texture::describe(source, options.texture_quality)
+                    .map_err(|error| Failure(2, format!("texture '{}': {error}", source.name)))?;
+                print::planned_texture(&mut out, &texture)?;
+            }
         }
         return Ok(());
     }

@@ -66,6 +66,20 @@ pub(super) fn report(out: &mut impl Write, store: &Path, report: &Report) -> std
     writeln!(out, "Next: diamantina-server serve {}", store.display())
 }
 
+/// What is known of a texture before it is built.
+pub(super) fn planned_texture(out: &mut impl Write, texture: &Texture) -> std::io::Result<()> {
+    writeln!(
+        out,
+        "texture {}: {} x {} texels in {} levels, at most {} tiles, {:.0} MiB of disk while at work; its bytes are not estimated",
+        texture.name,
+        texture.size[0],
+        texture.size[1],
+        texture.levels(),
+        texture.grid_tiles(),
+        texture.size.map(f64::from).iter().product::<f64>() * 4.0 / 3.0 / f64::from(1 << 20)
+    )
+}
+
 fn texture(out: &mut impl Write, texture: &Texture) -> std::io::Result<()> {
     writeln!(
         out,

@@ -9,8 +9,10 @@
 )]
 
 mod erosion;
+mod imagery;
 
 use erosion::{Lattice, Plan};
+pub use imagery::write_imagery;
 use rayon::prelude::*;
 use std::fs::File;
 use std::io::BufWriter;

@@ -2,7 +2,7 @@
 // pixels: a page whose device is lost at the first frame goes on counting frames.
 //
 // node check.mjs PLAYWRIGHT CHROMIUM URL CLIENT FOLDER: the folder of playwright-core, the browser, the server of scenes
-// `hills`, `plain` and `lake` (hills and water), the client's program, and a folder for pictures.
+// `hills`, `plain`, `lake` (hills and water) and `photo` (hills and imagery), the client's program, and a folder for pictures.
 import { execFileSync } from 'node:child_process';
 import { readFileSync, writeFileSync } from 'node:fs';
 import { createRequire } from 'node:module';
@@ -167,13 +167,31 @@ async function water(page, blank, graphics) {
     return `water ${beside.mean.toFixed(2)}`;
 }
 
+/// Imagery: as the client draws it, and not where it is left out.
+async function imagery(page, blank, graphics) {
+    const query = `scene=photo&error=${ERROR_PIXELS}${graphics === 'webgl' ? '&graphics=webgl' : ''}`;
+    const shot = async (more, name) => {
+        await page.goto('about:blank');
+        await page.goto(`${url}/?${query}${more}${hash(VIEW)}`);
+        await settled(page);
+        await page.keyboard.press('Tab');
+        await frames(page, 3);
+        return page.screenshot({ path: join(folder, `${graphics}-${name}.png`) });
+    };
+    const [draped, bare] = [await shot('', 'photo'), await shot('&texture=none', 'bare')];
+    const [beside, without] = [await compare(blank, [draped, photo]), await compare(blank, [draped, bare])];
+    check(beside.mean < 2 && beside.off < 0.01, `imagery differs from the client's: ${JSON.stringify(beside)}`);
+    check(without.off > 0.1, `imagery is hardly seen: ${JSON.stringify(without)}`);
+    return `imagery ${beside.mean.toFixed(2)}`;
+}
+
 /// A page that says what to choose from, if it is not told.
 async function choice(page) {
     await page.goto(`${url}/`);
     const links = page.locator('#message a');
     await links.first().waitFor({ timeout: PATIENCE });
     const names = await links.allTextContents();
-    check(names.toSorted().join() === 'hills,lake,plain', `to choose from: ${names}`);
+    check(names.toSorted().join() === 'hills,lake,photo,plain', `to choose from: ${names}`);
     await links.first().click();
     await page.waitForFunction(() => window.diamantina?.state().frames > 0, null, { timeout: PATIENCE });
     check((await state(page)).scene === 'hills', 'another scene was chosen');
@@ -183,6 +201,7 @@ async function choice(page) {
 
 const reference = headless('hills', VIEW, join(folder, 'client.png'));
 const lake = headless('lake', VIEW, join(folder, 'client-lake.png'));
+const photo = headless('photo', VIEW, join(folder, 'client-photo.png'));
 for (const graphics of ['webgpu', 'webgl']) {
     const began = Date.now();
     const args = [...COMMON, ...FLAGS[graphics]];
@@ -198,6 +217,7 @@ for (const graphics of ['webgpu', 'webgl']) {
         const look = async () => [
             await heights(page, reference, blank, graphics),
             await water(page, blank, graphics),
+            await imagery(page, blank, graphics),
         ].join(', ');
         const what = await look().catch(async (error) => {
             await page.screenshot({ path: join(folder, `${graphics}-failed.png`) }).catch(() => {});

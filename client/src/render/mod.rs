@@ -166,10 +166,12 @@ pub(crate) async fn device(
     Ok((adapter, device, queue))
 }
 
-/// What suits an adapter of what was asked for: one in software takes its time for each step.
+/// What suits an adapter of what was asked for: one in software takes minutes for what others do in no time.
 pub(crate) fn fit(options: &Options, adapter: &wgpu::Adapter) -> Options {
     let is_software = adapter.get_info().device_type == wgpu::DeviceType::Cpu;
-    Options { anisotropy: if is_software { 1 } else { options.anisotropy }, ..*options }
+    let can =
+        adapter.get_downlevel_capabilities().flags.contains(wgpu::DownlevelFlags::ANISOTROPIC_FILTERING);
+    Options { anisotropy: if can && !is_software { options.anisotropy } else { 1 }, ..*options }
 }
 
 /// A diamond's place, as the vertex shader takes it.

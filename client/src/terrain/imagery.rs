@@ -20,6 +20,16 @@ pub enum Imagery {
 }
 
 impl Imagery {
+    /// What a user asks for by a name, by "none", or not at all.
+    #[must_use]
+    pub fn asked(name: Option<String>) -> Self {
+        match name {
+            None => Self::First,
+            Some(name) if name == "none" => Self::None,
+            Some(name) => Self::Named(name),
+        }
+    }
+
     /// The position of the texture in a scene.
     pub(super) fn find(&self, scene: &Scene) -> Result<Option<usize>, TerrainError> {
         match self {

@@ -20,6 +20,7 @@ use super::raster::{Dtype, Picture, Place, Raster, SIDE_MAX, Samples, Wanted, Wi
 use super::samples::{band_of, decode};
 use super::tiff_header::{CHUNKS_MAX, Header};
 use super::units::named_metres;
+use super::world_file;
 
 /// Decoded bytes of one strip or tile, at most: a tile of 8192 x 8192 floats.
 const CHUNK_BYTES_MAX: u64 = 256 << 20;
@@ -125,7 +126,10 @@ pub(super) fn open(
         ));
     }
     let keys = GeoKeys::read(path, &header)?;
-    let place = place(path, &header, layout, &keys)?;
+    let place = match place(path, &header, layout, &keys)? {
+        None => world_file::find(path, layout.height)?,
+        place => place,
+    };
     let nodata = match header.text(42113)?.filter(|t| !t.is_empty()) {
         None => None,
         Some(text) => dtype.hold(text.parse().map_err(|_| {

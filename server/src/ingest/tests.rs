@@ -665,4 +665,5 @@ fn a_usgs_dem_is_padded_where_its_columns_are_ragged() {
 // Behind the macro that they use.
 mod errors;
 mod geotiff;
+mod imagery;
 mod real;
