@@ -52,7 +52,8 @@ fn imagery_at(number: u32, start: vec2<f32>, right: vec2<f32>, down: vec2<f32>) 
     var parent_place = place;
     var weight = 1.0;
     for (var level = 0; level < 17; level++) {
-        let quarter = select(vec2<u32>(0u), vec2<u32>(1u), place >= vec2<f32>(0.5));
+        // Not by `select`, which WebGL2 lacks for vectors of integers.
+        let quarter = vec2<u32>(place >= vec2<f32>(0.5));
         let pair = select(node.z, node.w, quarter.y == 1u);
         let child = select(pair & 0xffffu, pair >> 16u, quarter.x == 1u);
         if finer <= 0.0 || child == 0u {
