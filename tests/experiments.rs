@@ -1,5 +1,6 @@
 //! The papers' tables on real ground: what a bitree saves, what strips save, what an observer notices.
 
+use crate::hostile::{assert_failed, server};
 use crate::world::data;
 use clap::{Args, FromArgMatches};
 use diamantina_server::experiment::report::{Report, Table};
@@ -139,4 +140,42 @@ fn a_mask_leaves_less_than_a_third_of_the_triangles_and_the_skyline() {
         let pixels = moved.caption.split("skylines by ").nth(1).unwrap().split(' ').next().unwrap();
         assert!(pixels.parse::<f64>().unwrap() <= 1.0, "{}", moved.caption);
     }
+}
+
+/// Degrees are metres from the raster's own corner: two of one size look as if they lay in one place.
+#[test]
+fn a_mask_of_another_place_and_heights_beyond_all_measure_are_refused() {
+    let scratch = tempfile::tempdir().unwrap();
+    // A GeoTIFF of degrees with its corner at this longitude.
+    let write = |name: &str, west: f64, at: &dyn Fn(usize) -> f32| {
+        let file = std::fs::File::create(scratch.path().join(name)).unwrap();
+        let mut encoder = tiff::encoder::TiffEncoder::new(std::io::BufWriter::new(file)).unwrap();
+        let mut image = encoder.new_image::<tiff::encoder::colortype::Gray32Float>(80, 80).unwrap();
+        let (scale, tie): (&[f64], &[f64]) = (&[0.001, 0.001, 0.0], &[0.0, 0.0, 0.0, west, 47.0, 0.0]);
+        let keys: &[u16] = &[1, 1, 0, 3, 1024, 0, 1, 2, 1025, 0, 1, 2, 2048, 0, 1, 4326];
+        image.encoder().write_tag(tiff::tags::Tag::ModelPixelScaleTag, scale).unwrap();
+        image.encoder().write_tag(tiff::tags::Tag::ModelTiepointTag, tie).unwrap();
+        image.encoder().write_tag(tiff::tags::Tag::GeoKeyDirectoryTag, keys).unwrap();
+        image.write_data(&(0..6400).map(at).collect::<Vec<f32>>()).unwrap();
+    };
+    let hill = |i: usize| ((i % 80) * (i / 80)) as f32;
+    write("dem.tif", 8.0, &hill);
+    write("spike.tif", 8.0, &|i| if i == 3000 { 1e9 } else { hill(i) });
+    write("here.tif", 8.0, &|i| (i % 2) as f32);
+    write("there.tif", -72.0, &|i| (i % 2) as f32);
+    let run = |text: &str| {
+        server(
+            scratch.path(),
+            &format!("experiment tolerances {text} --crs source --tolerances 5 -o {{}}/out"),
+        )
+    };
+    let ended = run("{}/dem.tif --mask {}/here.tif");
+    assert_eq!(ended.code, Some(0), "{ended:?}");
+    assert_failed(
+        &run("{}/dem.tif --mask {}/there.tif"),
+        2,
+        &["--mask", "own grid", "there.tif", "-72.0"],
+        "a mask of elsewhere",
+    );
+    assert_failed(&run("{}/spike.tif"), 1, &["spike.tif", "1000000000", "262 km", "--nodata"], "a spike");
 }

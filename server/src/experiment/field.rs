@@ -2,7 +2,7 @@
 //!
 //! Heights are metres in `f64`, NaN for no data, rows from the south: a window of a DEM of (2^k + 1)^2
 //! samples, padded with no data where it leaves the DEM. They are rounded to 28 bits below the power of two
-//! above the largest (4000 m: to 8 µm), which changes nothing in integers: then all means of means down to
+//! above the largest (4000 m: to 8 µm; windows refuse heights so large that it would be a millimetre), which changes nothing in integers: then all means of means down to
 //! the finest level are exact in `f64`, and an error of 0 is 0.
 
 use super::scan::rows;
@@ -19,6 +19,7 @@ pub struct Field {
     log2: u8,
     heights: Vec<f64>,
     cell: [f64; 2],
+    quantum: f64,
 }
 
 impl Field {
@@ -39,7 +40,13 @@ impl Field {
         for h in &mut heights {
             *h = (*h / quantum).round() * quantum;
         }
-        Some(Self { log2, heights, cell })
+        Some(Self { log2, heights, cell, quantum })
+    }
+
+    /// How far a height may be off its source's for being rounded, in metres: no error of a mesh tells of it.
+    #[must_use]
+    pub fn rounding(&self) -> f64 {
+        self.quantum / 2.0
     }
 
     /// The window of a source with its south-west sample at `origin`, padded with no data. `None` where it has

@@ -62,7 +62,7 @@ pub struct Options {
     #[arg(long, default_value_t = 50.0, value_name = "METRES")]
     pub(crate) eye: f64,
     /// `curvature`: how much distance forgives: a in T (a d / D + 1)
-    #[arg(long, default_value_t = 20.0, value_name = "A")]
+    #[arg(long, default_value_t = 20.0, value_name = "A", allow_negative_numbers = true)]
     pub(crate) forgiveness: f64,
 }
 
@@ -187,6 +187,21 @@ pub enum ExperimentError {
         expected: String,
         /// What was given.
         found: String,
+    },
+    /// Heights that nothing on a planet has.
+    #[error(
+        "{file}: expected heights below 262 km, found one of {largest} m in the window at sample {}, {}: beside it the others are rounded by \
+         up to {rounding} m; if it stands for no data, say --nodata", at[0], at[1]
+    )]
+    Heights {
+        /// The DEM.
+        file: String,
+        /// The window's south-west sample.
+        at: [u32; 2],
+        /// The largest height, in metres.
+        largest: f64,
+        /// How far others are off, in metres.
+        rounding: f64,
     },
     /// An option would change nothing.
     #[error("--{option}: '{name}' does not heed it; leave it out, or run {heeding}")]

@@ -48,7 +48,12 @@ pub fn lines(
     if all().next().is_none() {
         return Err(ExperimentError::Plot(format!("'{title}' has no points")));
     }
-    let label = |v: &f64| if is_log { format!("{:.3}", 10f64.powf(*v)) } else { format!("{v:.3}") };
+    // Of powers of ten and of halves between, three digits.
+    let rounded = |v: f64| {
+        let last = 10f64.powf(v.floor() - 2.0);
+        (10f64.powf(v) / last).round() * last
+    };
+    let label = |v: &f64| if is_log { format!("{:.3}", rounded(*v)) } else { format!("{v:.3}") };
     let label = |v: &f64| label(v).trim_end_matches('0').trim_end_matches('.').to_owned();
     let mut text = String::new();
     let failed = |e: &dyn std::fmt::Display| ExperimentError::Plot(e.to_string());

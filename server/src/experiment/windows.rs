@@ -125,7 +125,17 @@ pub(super) fn read(
                 return Err(ExperimentError::Stopped);
             }
             progress.advance(1);
-            let Some(field) = Field::read(&source, at, log2)?.filter(|f| passes(f, options.windows)) else {
+            let read = Field::read(&source, at, log2)?;
+            if let Some(coarse) = read.as_ref().filter(|field| field.rounding() > ROUNDING_MAX) {
+                let largest = coarse.heights().iter().fold(0.0f64, |most, h| most.max(h.abs()));
+                return Err(ExperimentError::Heights {
+                    file: name,
+                    at,
+                    largest,
+                    rounding: coarse.rounding(),
+                });
+            }
+            let Some(field) = read.filter(|f| passes(f, options.windows)) else {
                 continue;
             };
             let weights = mask.as_ref().map(|m| weights(m, at, log2)).transpose()?;
@@ -143,6 +153,9 @@ pub(super) fn read(
     }
     Ok(windows)
 }
+
+/// Heights are rounded, which errors do not tell of: at most so many metres.
+const ROUNDING_MAX: f64 = 1e-3;
 
 fn file_name(path: &Path) -> String {
     path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
@@ -185,15 +198,24 @@ fn open_mask(path: &Path, ingest: &ingest::Options, source: &Source) -> Result<S
     // Weights of another place would be taken for those of this one. A raster that says not where it lies is believed.
     let [own, given] = [source, &mask].map(Source::grid);
     let says_where = given.crs.is_some() || given.origin != [0.0; 2];
-    let is_there = (0..2).all(|k| {
-        let [apart, coarser] = [given.origin[k] - own.origin[k], given.cell[k] - own.cell[k]];
-        apart.abs() <= 0.01 * own.cell[k]
-            && coarser.abs() * f64::from(own.width.max(own.height)) <= own.cell[k]
-    });
+    // Metres of degrees begin at the raster itself: where that is its coordinates tell.
+    let is_elsewhere = match (&own.crs, &given.crs) {
+        (Some(own), Some(given)) => {
+            (0..2).any(|k| (own.origin[k] - given.origin[k]).abs() > 0.01 * own.step[k].abs())
+        }
+        _ => false,
+    };
+    let is_there = !is_elsewhere
+        && (0..2).all(|k| {
+            let [apart, coarser] = [given.origin[k] - own.origin[k], given.cell[k] - own.cell[k]];
+            apart.abs() <= 0.01 * own.cell[k]
+                && coarser.abs() * f64::from(own.width.max(own.height)) <= own.cell[k]
+        });
     if says_where && !is_there {
         let place = |grid: &ingest::Grid| {
             let ([x, y], [dx, dy]) = (grid.origin, grid.cell);
-            format!("the south-west sample at {x:.2}, {y:.2}, {dx:.4} x {dy:.4} m a cell")
+            let [x, y] = grid.crs.as_ref().map_or([x, y], |crs| crs.origin);
+            format!("the south-west sample at {x:.4}, {y:.4}, {dx:.4} x {dy:.4} m a cell")
         };
         return Err(ExperimentError::Options {
             option: "--mask",
