@@ -6,14 +6,14 @@ use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
 use std::sync::LazyLock;
-use tiff::encoder::{Compression, DeflateLevel, TiffEncoder, colortype};
+use tiff::encoder::{TiffEncoder, colortype};
 use tiff::tags::Tag;
 
 /// Texels along each side of a sample of heights, where that makes no more than `SIDE_MAX` in all.
 const FINER: u32 = 2;
 
-/// Texels along each side of the picture, at most.
-const SIDE_MAX: u32 = 8192;
+/// Texels along each side of the picture, at most: 50 MB, not compressed.
+const SIDE_MAX: u32 = 4096;
 
 /// Rows that are made and written at once.
 const ROWS: u32 = 64;
@@ -88,7 +88,7 @@ fn colour([x, y]: [f64; 2], above: f64, [east, north]: [f64; 2]) -> Colour {
     ground.map(|value| value * light * grain)
 }
 
-/// Writes the picture of a sample of `samples` a side as a GeoTIFF: two texels along each side of a sample of heights, or 8192
+/// Writes the picture of a sample of `samples` a side as a GeoTIFF: two texels along each side of a sample of heights, or 4096
 /// in all. It is black in the sea, which it declares as nothing.
 ///
 /// # Errors
@@ -122,8 +122,7 @@ pub fn write_imagery(path: &Path, samples: u32) -> Result<(), String> {
         (0..side as usize).flat_map(one).collect()
     };
     let file = BufWriter::new(File::create(path).map_err(|e| failed(&e))?);
-    let encoder = TiffEncoder::new(file).map_err(|e| failed(&e))?;
-    let mut encoder = encoder.with_compression(Compression::Deflate(DeflateLevel::Fast));
+    let mut encoder = TiffEncoder::new(file).map_err(|e| failed(&e))?;
     let mut image = encoder.new_image::<colortype::RGB8>(side, side).map_err(|e| failed(&e))?;
     image.rows_per_strip(ROWS).map_err(|e| failed(&e))?;
     let scale: &[f64] = &[texel, texel, 0.0];
