@@ -8,6 +8,7 @@
 )]
 
 mod motion;
+mod truth;
 mod water;
 
 use super::pipelines::RECORD;
@@ -36,6 +37,8 @@ const PLAIN: Look = Look {
     background: MAGENTA,
     sun: Sun { azimuth_degrees: 315.0, altitude_degrees: 45.0 },
     colours: Colours::Terrain,
+    range: None,
+    shading: Shading::Soft,
     haze: 0.0,
     exaggeration: 1.0,
     show_levels: false,
@@ -48,6 +51,7 @@ const PLAIN: Look = Look {
         clarity: None,
         mirror_scale: 1.0,
     },
+    annotations: Annotations { scale_bar: false, north_arrow: false, legend: false },
 };
 
 /// A layer with all surfaces of its forest, decoded from payloads as a client does.
