@@ -211,13 +211,13 @@ fn metres(length: f64) -> String {
 }
 
 /// Where a direction on the level points on the screen, right and down, seen from far away in the direction of the camera:
-/// of length 1 across the picture, and shorter towards its depth.
+/// of length 1 across the picture, and shorter towards its depth. `flattest`: the sine of the angle above the level from
+/// which it is seen at least.
 fn on_screen(camera: &Camera, direction: DVec2, flattest: f64) -> DVec2 {
     let [right, up, _] = camera.axes();
     // The picture's right is level; what lies ahead of the eye goes up the picture.
     let ahead = DVec3::Z.cross(right);
-    let rise = up.dot(ahead);
-    let rise = if rise.abs() < flattest { flattest.copysign(rise) } else { rise };
+    let rise = up.dot(ahead).max(flattest);
     let direction = direction.extend(0.0);
     DVec2::new(direction.dot(right), -direction.dot(ahead) * rise)
 }

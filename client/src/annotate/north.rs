@@ -1,7 +1,8 @@
 //! A north arrow: a compass that lies on the level where the middle of the picture is, as it is seen from there.
 //!
 //! Its needle points to the north pole where the frame's place on the globe is known, else along the frame's y axis. It is
-//! foreshortened as level ground is; seen flatter than 7 degrees it is drawn as from 7 degrees, or it would be a line.
+//! foreshortened as level ground is; where the camera looks down by less than 7 degrees, or up, it is drawn as from 7
+//! degrees above, or it would be a line, or upside down.
 
 use super::{Anchor, Ink, Subject, on_screen, put, text};
 use egui::{Align2, Color32, Painter, Pos2, Rect, Shape, Stroke, vec2};
