@@ -141,14 +141,14 @@ impl Ink {
             Self {
                 text: Color32::from_gray(240),
                 faint: Color32::from_gray(185),
-                plate: Color32::from_rgba_unmultiplied(16, 17, 19, 215),
+                plate: Color32::from_rgba_unmultiplied(16, 17, 19, 230),
                 border: Color32::from_white_alpha(60),
             }
         } else {
             Self {
                 text: Color32::from_gray(16),
                 faint: Color32::from_gray(70),
-                plate: Color32::from_rgba_unmultiplied(255, 255, 255, 222),
+                plate: Color32::from_rgba_unmultiplied(255, 255, 255, 238),
                 border: Color32::from_black_alpha(70),
             }
         }
