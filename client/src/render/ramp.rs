@@ -370,15 +370,15 @@ mod tests {
                 let look = Look { colours, ..Look::default() };
                 let scale = Scale::over(&look, heights);
                 let [low, high] = scale.range();
-                let at = |step: i32| low + (high - low) * f64::from(step) / 1024.0;
+                let at = |step: usize| low + (high - low) * step as f64 / 1024.0;
                 let table: Vec<[u8; 3]> = (0..=1024).map(|step| scale.colour(at(step))).collect();
                 for step in (0..=1024).step_by(31) {
-                    let found = table[step as usize];
+                    let found = table[step];
                     let apart = |c: &[u8; 3]| {
                         c.iter().zip(found).map(|(a, b)| i32::from(a.abs_diff(b)).pow(2)).sum::<i32>()
                     };
-                    let same = (0..=1024_i32).filter(|i| apart(&table[*i as usize]) == 0);
-                    let farthest = same.map(|i: i32| (i - step).abs()).max().unwrap();
+                    let same = (0..=1024_usize).filter(|i| apart(&table[*i]) == 0);
+                    let farthest = same.map(|i| i.abs_diff(step)).max().unwrap();
                     assert!(farthest <= 24, "{colours:?} {heights:?}: {} and {farthest} on", at(step));
                 }
             }

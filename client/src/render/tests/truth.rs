@@ -171,7 +171,7 @@ fn the_sun_is_mirrored_once_and_hidden_by_hills() {
         let ahead = look.sun.direction() * DVec3::new(1.0, 1.0, -1.0);
         let camera = Camera { eye: at - ahead * 100.0, target: at, fov_y: 0.03, size: [301, 301] };
         let mut offscreen = offscreen(1, 1 << 30);
-        offscreen.draw(&[land.layer.clone(), water.layer], &camera, &items, look).unwrap();
+        offscreen.draw(&[land.layer, water.layer], &camera, &items, look).unwrap();
         offscreen.read().unwrap()
     };
     let across = |picture: &Picture| {
