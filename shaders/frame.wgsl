@@ -27,6 +27,9 @@ struct Frame {
     land: array<vec4<f32>, 8>,
     // rgb: colours of the sea, shallow to deep. w: where each stands in the range of depths, 0 to 1.
     sea: array<vec4<f32>, 4>,
+    // x: how terrain is lit: 0 softly, 1 by the cosine alone, 2 not at all. y: 1 where slopes are coloured, and not heights.
+    // z: 1 where rock shows on steep ground. w: how much the air glows around the sun.
+    style: vec4<f32>,
 }
 
 struct Layer {
@@ -85,6 +88,24 @@ fn sky_towards(direction: vec3<f32>) -> vec3<f32> {
     return above * mix(1.0, 0.74, smoothstep(0.0, 0.7, -direction.z));
 }
 
+// Half of what the sun measures across, in radians: 0.53 degrees in all.
+const SUN_RADIUS: f32 = 0.004625;
+
+// What the sun adds to the sky in a direction of length 1: its disc, far brighter than white, and the glow of the air
+// around it, as wide as dust and droplets scatter light ahead. `pixel`: radians of a pixel.
+fn sun_towards(direction: vec3<f32>, pixel: f32) -> vec3<f32> {
+    if frame.options.w != 0.0 {
+        return vec3<f32>(0.0);
+    }
+    // The chord: the angle itself where that is small, and exact there, as the cosine is not.
+    let off = length(direction - frame.sun.xyz);
+    let soft = max(0.5 * pixel, 1e-5);
+    let up = smoothstep(-soft, soft, direction.z);
+    let disc = up * (1.0 - smoothstep(SUN_RADIUS - soft, SUN_RADIUS + soft, off));
+    let glow = frame.style.w * smoothstep(-0.1, 0.05, direction.z) * (0.45 * exp(-off / 0.025) + 0.14 * exp(-off / 0.15));
+    return vec3<f32>(1.08, 1.04, 0.97) * (40.0 * disc + glow);
+}
+
 // The light that a surface sends back: the sun, and the sky's half sphere, brighter from above. The sun
 // fades out softly, as it does on rough ground: a sharp edge of light would follow the mesh.
 fn lit(albedo: vec3<f32>, normal: vec3<f32>) -> vec3<f32> {
@@ -94,12 +115,19 @@ fn lit(albedo: vec3<f32>, normal: vec3<f32>) -> vec3<f32> {
     return albedo * (sun + sky);
 }
 
+// Linear light and sRGB, from 0 to 1.
+fn to_srgb(c: vec3<f32>) -> vec3<f32> {
+    let curve = 1.055 * pow(c, vec3<f32>(1.0 / 2.4)) - 0.055;
+    return select(curve, 12.92 * c, c <= vec3<f32>(0.0031308));
+}
+
+fn from_srgb(c: vec3<f32>) -> vec3<f32> {
+    let curve = pow((c + 0.055) / 1.055, vec3<f32>(2.4));
+    return select(curve, c / 12.92, c <= vec3<f32>(0.04045));
+}
+
 // A finished colour, as the target wants it.
 fn encoded(linear: vec3<f32>) -> vec4<f32> {
     let c = clamp(linear, vec3<f32>(0.0), vec3<f32>(1.0));
-    if frame.options.x == 0.0 {
-        return vec4<f32>(c, 1.0);
-    }
-    let curve = 1.055 * pow(c, vec3<f32>(1.0 / 2.4)) - 0.055;
-    return vec4<f32>(select(curve, 12.92 * c, c <= vec3<f32>(0.0031308)), 1.0);
+    return vec4<f32>(select(to_srgb(c), c, frame.options.x == 0.0), 1.0);
 }

@@ -16,5 +16,13 @@ fn sky_vertex(@builtin(vertex_index) index: u32) -> Ray {
 
 @fragment
 fn sky_fragment(ray: Ray) -> @location(0) vec4<f32> {
-    return encoded(sky_towards(normalize(ray.direction)));
+    let direction = normalize(ray.direction);
+    let pixel = max(length(dpdx(direction)), length(dpdy(direction)));
+    let sky = sky_towards(direction);
+    // Of what is mirrored, water adds the sun by itself: brighter than a texture holds, where alpha says that nothing hides
+    // it, and once only where waves break it into glitter.
+    if frame.water.w > -1e29 {
+        return vec4<f32>(encoded(sky).rgb, 0.0);
+    }
+    return encoded(sky + sun_towards(direction, pixel));
 }

@@ -21,23 +21,41 @@ fn sea_colour(t: f32) -> vec3<f32> {
     return colour;
 }
 
-// `pixel_height`: metres of height from this pixel to the next.
-fn albedo_at(height: f32, pixel_height: f32, normal_up: f32) -> vec3<f32> {
+// The colour of a height, or of a slope. `pixel_value`: how much more it is from this pixel to the next.
+fn albedo_at(value: f32, pixel_value: f32, normal_up: f32) -> vec3<f32> {
     if layer.is_water != 0.0 {
         return frame.water.rgb;
     }
     if frame.options.z != 0.0 {
-        return vec3<f32>(0.5);
+        return vec3<f32>(select(1.0, 0.5, frame.style.x == 0.0));
     }
     // Rock shows on steep ground.
-    let steep = mix(0.7, 1.0, smoothstep(0.45, 0.9, normal_up));
-    let land = steep * land_colour((height - layer.land_base) * layer.per_height);
+    let steep = select(1.0, mix(0.7, 1.0, smoothstep(0.45, 0.9, normal_up)), frame.style.z != 0.0);
+    let land = steep * land_colour((value - layer.land_base) * layer.per_height);
     if layer.per_depth == 0.0 {
         return land;
     }
-    // The shore is as wide as a pixel, so that it does not flicker.
-    let sea = sea_colour(-height * layer.per_depth);
-    return mix(sea, land, clamp(height / pixel_height + 0.5, 0.0, 1.0));
+    // The shore is as wide as a pixel, so that it does not flicker; where colours are to be read they are not mixed.
+    let sea = sea_colour(-value * layer.per_depth);
+    let shore = select(step(0.0, value), clamp(value / pixel_value + 0.5, 0.0, 1.0), frame.style.x == 0.0);
+    return mix(sea, land, shore);
+}
+
+// A colour in the light that the look asks for.
+fn shaded_colour(albedo: vec3<f32>, normal: vec3<f32>) -> vec3<f32> {
+    if frame.style.x == 0.0 {
+        return lit(albedo, normal);
+    }
+    if frame.style.x == 2.0 || layer.is_water != 0.0 {
+        return albedo;
+    }
+    return from_srgb(to_srgb(albedo) * max(dot(normal, frame.sun.xyz), 0.0));
+}
+
+// Degrees from the level, of heights that are not multiplied.
+fn slope_of(shaded: Shaded) -> f32 {
+    let across = length(shaded.about.xy);
+    return degrees(atan2(across, sqrt(max(1.0 - across * across, 0.0))));
 }
 
 // Six hues in turn, so that neighbouring levels differ.
@@ -50,14 +68,15 @@ fn terrain_colour(shaded: Shaded) -> vec4<f32> {
     let normal = normal_of(shaded);
     let imagery = imagery_at(shaded.tile, shaded.drape, dpdx(shaded.drape), dpdy(shaded.drape)) * frame.drape.y;
     let height = (frame.sun.w + shaded.from_eye.z) / layer.exaggeration;
-    var albedo = albedo_at(height, max(fwidth(height), 1e-6), normal.z);
+    let value = select(height, slope_of(shaded), frame.style.y != 0.0);
+    var albedo = albedo_at(value, max(fwidth(height), 1e-6), normal.z);
     if frame.options.y != 0.0 {
         albedo = mix(albedo, level_tint(round(shaded.about.z)), 0.5);
     }
     // Pictures of the ground have its light in them already: how much more they get is for the viewer to say.
-    let light = lit(vec3<f32>(1.0), normal);
-    let colour = albedo * light * (1.0 - imagery.a) + imagery.rgb * mix(vec3<f32>(1.0), light, frame.drape.x);
-    return encoded(hazed(colour, shaded.from_eye));
+    let ground = shaded_colour(albedo, normal) * (1.0 - imagery.a);
+    let photo = imagery.rgb * mix(vec3<f32>(1.0), shaded_colour(vec3<f32>(1.0), normal), frame.drape.x);
+    return encoded(hazed(ground + photo, shaded.from_eye));
 }
 
 @fragment

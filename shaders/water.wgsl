@@ -124,10 +124,14 @@ fn water_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
     if image.z > 0.0 && bank > p.z + 0.002 * distance && bank < 1e9 {
         image = vec3<f32>(here, 1.0);
     }
-    let found = textureSampleLevel(mirrored, smooth_sampler, image.xy, 0.0).rgb;
+    let found = textureSampleLevel(mirrored, smooth_sampler, image.xy, 0.0);
     // Past the edges nothing was drawn.
     let lost = select(1.0, smoothstep(0.0, 0.1, outside(image.xy)), image.z > 0.0);
-    let above = mix(found, sky_towards(back), lost);
+    // Still water mirrors the sun's disc, where alpha says that there is sky; waves break it into the glitter below.
+    let angle = 2.0 * length(frame.up.xyz) / f32(textureDimensions(scene).y);
+    let is_open = 1.0 - mix(found.a, 0.0, lost);
+    let disc = sun_towards(back, angle) * (is_open * (1.0 - water.optics.w));
+    let above = mix(found.rgb, sky_towards(back), lost) + disc;
     let sun = max(dot(back, frame.sun.xyz), 0.0);
     let glitter = water.optics.w * (pow(sun, 900.0) * 12.0 + pow(sun, 60.0) * 0.25);
     let colour = mix(hazed(through, p), above + glitter * vec3<f32>(1.08, 1.04, 0.97), fresnel);

@@ -89,12 +89,21 @@ const CLIENT: &[(&str, &[&str])] = &[
     ("controls", &["camera"]),
     ("pick", &["drawing", "surface"]),
     ("overview", &["camera"]),
-    ("headless", &["camera", "fetch", "overview", "picture", "render", "surface", "terrain"]),
+    ("globe", &[]),
+    // Over pictures with a window and without.
+    ("annotate", &["camera", "drawing", "globe", "pick", "render"]),
+    (
+        "headless",
+        &[
+            "annotate", "camera", "drawing", "fetch", "globe", "overview", "pick", "picture", "render",
+            "surface", "terrain",
+        ],
+    ),
     (
         "viewer",
         &[
-            "camera", "controls", "drawing", "encoding", "headless", "overview", "pick", "picture", "render",
-            "surface", "terrain", "texture",
+            "annotate", "camera", "controls", "drawing", "encoding", "globe", "headless", "overview", "pick",
+            "picture", "render", "surface", "terrain", "texture",
         ],
     ),
     ("web", &["encoding", "fetch", "render", "terrain", "texture", "viewer"]),

@@ -1,8 +1,10 @@
 //! The command line of the client.
 
+mod annotate;
 mod load;
 mod look;
 
+use annotate::AnnotateArgs;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use diamantina_client::camera::{Camera, FOV_Y};
 use diamantina_client::doctor::{self, Verdict};
@@ -10,12 +12,13 @@ use diamantina_client::encoding::Encoding;
 use diamantina_client::fetch::{self, FetchError};
 use diamantina_client::headless::{self, Flight, FlightPath, FrameLine, PictureReport};
 use diamantina_client::morph;
+use diamantina_client::render::Look;
 use diamantina_client::sight::Sight;
 use diamantina_client::terrain::{self, Imagery, Terrain, TerrainError};
 use diamantina_client::texture::FADE_SECONDS;
 use diamantina_client::viewer::{self, Viewer};
 use glam::DVec3;
-use look::LookArgs;
+use look::{LookArgs, untrue};
 use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -69,7 +72,7 @@ struct DoctorArgs {
 struct ViewerArgs {
     #[command(flatten)]
     view: ViewArgs,
-    /// Seconds that points take to move where the level of detail changes [default: 0.3, and 0 for tin]
+    /// Seconds that points take to move where the level of detail changes [default: 0.3, and 0 for tin and with --true]
     #[arg(long, value_name = "SECONDS")]
     morph: Option<f64>,
 }
@@ -116,6 +119,8 @@ struct ViewArgs {
     memory: usize,
     #[command(flatten)]
     look: LookArgs,
+    #[command(flatten)]
+    annotate: AnnotateArgs,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -245,6 +250,10 @@ pub(crate) fn run() -> ExitCode {
 }
 
 impl ViewArgs {
+    fn look(&self, terrain: &Terrain) -> Look {
+        Look { annotations: self.annotate.annotations(), ..self.look.look(terrain.scene()) }
+    }
+
     fn open(&self, morph_seconds: f64) -> Result<Terrain, Failure> {
         if !(self.error_pixels.is_finite() && self.error_pixels > 0.0) {
             return Err(Failure(
@@ -253,6 +262,10 @@ impl ViewArgs {
             ));
         }
         self.look.check()?;
+        self.annotate.check(self.size)?;
+        if self.look.is_true && morph_seconds > 0.0 {
+            return Err(untrue("--morph", "what is drawn is what has arrived"));
+        }
         if !(self.foveation.is_finite() && self.foveation >= 1.0) {
             return Err(Failure(2, format!("--foveation {}: expected a number from 1 on", self.foveation)));
         }
@@ -272,7 +285,11 @@ impl ViewArgs {
             },
             layers: self.layers.clone(),
             zone: self.zone.clone(),
-            imagery: Imagery::asked(self.texture.clone()),
+            // Colours tell heights, unless a picture is asked for.
+            imagery: match &self.texture {
+                None if self.look.is_true => Imagery::None,
+                asked => Imagery::asked(asked.clone()),
+            },
             texture_bytes: usize::from(self.texture_memory) << 20,
             fade_seconds: if morph_seconds > 0.0 { FADE_SECONDS.min(morph_seconds) } else { 0.0 },
             ..terrain::Options::default()
@@ -321,7 +338,7 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
             headless::framed(&mut terrain, size, exaggeration, patience)
         }
     };
-    let look = args.view.look.look(terrain.scene());
+    let look = args.view.look(&terrain);
     let (picture, report) =
         headless::picture(&mut terrain, &camera, &look, &args.view.look.options(), patience)?;
     headless::save(&picture, &args.output)?;
@@ -371,8 +388,8 @@ fn print_report(args: &RenderArgs, r: &PictureReport) -> std::io::Result<()> {
 
 fn view(args: &ViewerArgs) -> Result<(), Failure> {
     let morph = args.morph.unwrap_or(match args.view.encoding {
-        EncodingName::Points => MORPH_SECONDS,
-        EncodingName::Tin => 0.0,
+        EncodingName::Points if !args.view.look.is_true => MORPH_SECONDS,
+        EncodingName::Points | EncodingName::Tin => 0.0,
     });
     if !(0.0..=morph::SECONDS_MAX).contains(&morph) {
         let max = morph::SECONDS_MAX;
@@ -388,7 +405,7 @@ fn view(args: &ViewerArgs) -> Result<(), Failure> {
     };
     let view = ViewArgs { url: url.clone(), ..args.view.clone() };
     let terrain = view.open(morph)?;
-    let look = view.look.look(terrain.scene());
+    let look = view.look(&terrain);
     let title = format!("{} - Diamantina", terrain.scene().name);
     let viewer = Viewer::new(terrain, &url, look, view.size, at);
     viewer::window::run(viewer, &title, &view.look.options()).map_err(|e| Failure(1, e.to_string()))
@@ -473,7 +490,7 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
     let (mut slowest_cut, mut draw_sum, mut last) = (0.0f64, 0.0, None);
     let mut failed = None;
     let bar = indicatif::ProgressBar::new(args.frames.into());
-    let look = args.view.look.look(terrain.scene());
+    let look = args.view.look(&terrain);
     headless::fly(&mut terrain, &path, &flight, &look, &args.view.look.options(), |line, _| {
         slowest_cut = slowest_cut.max(line.cut_ms);
         draw_sum += line.draw_ms;

@@ -1,7 +1,11 @@
 //! Pictures and flights without a window.
 
+use crate::annotate::{self, Subject};
 use crate::camera::{Camera, FOV_Y};
+use crate::drawing::DrawItem;
+use crate::globe::Globe;
 use crate::overview::{around, stretched};
+use crate::pick::Picker;
 use crate::picture::{Picture, write_png};
 use crate::render::{self, FrameStats, Look, Offscreen, RenderError};
 use crate::surface::Surface;
@@ -203,10 +207,44 @@ pub fn picture(
     // Everything is uploaded by now: this is what a frame costs.
     let started = Instant::now();
     let frame = offscreen.draw(layers, &drawn, &view.items, look)?;
-    let picture = offscreen.read()?;
+    let mut picture = offscreen.read()?;
     let milliseconds_a_frame = started.elapsed().as_secs_f64() * 1e3;
+    if look.annotations.is_any() {
+        Annotator::new(terrain.scene()).annotate(&mut offscreen, terrain, &drawn, &view.items, look);
+        picture = offscreen.read()?;
+    }
     let report = report(terrain, camera, look, &view, frame, milliseconds_a_frame);
     Ok((picture, report))
+}
+
+/// Writes what a look asks for over pictures of a scene.
+#[derive(Debug)]
+struct Annotator {
+    picker: Picker,
+    globe: Option<Globe>,
+}
+
+impl Annotator {
+    fn new(scene: &Scene) -> Self {
+        Self { picker: Picker::default(), globe: Globe::of(&scene.frame) }
+    }
+
+    /// Over the picture last drawn. `camera`: as it was drawn, its heights stretched.
+    fn annotate(
+        &mut self,
+        offscreen: &mut Offscreen,
+        terrain: &Terrain,
+        camera: &Camera,
+        items: &[DrawItem],
+        look: &Look,
+    ) {
+        let centre = annotate::centre(&mut self.picker, &terrain.scene().layers, items, look, camera);
+        let layers = terrain.shown_scene().layers;
+        let subject = Subject { camera, look, layers: &layers, globe: self.globe.as_ref(), centre };
+        offscreen.draw_over(annotate::pixels_per_point(camera.size), |painter, area| {
+            annotate::show(painter, area, &subject);
+        });
+    }
 }
 
 fn report(
@@ -492,6 +530,8 @@ pub fn fly(
 ) -> Result<(), HeadlessError> {
     let mut offscreen = Offscreen::new(options)?;
     terrain.set_exaggeration(look.exaggeration);
+    // Of a version of the scene.
+    let mut annotator: Option<(String, Annotator)> = None;
     let started = Instant::now();
     for frame in 0..flight.frames {
         if flight.frames_a_second > 0.0 {
@@ -516,6 +556,13 @@ pub fn fly(
         // Of this frame's version: another may have taken over, and lie elsewhere.
         offscreen.drape(view.drape.as_ref());
         let stats = offscreen.draw(&terrain.scene().layers, &drawn, &view.items, &look)?;
+        if look.annotations.is_any() {
+            let version = &terrain.scene().version;
+            let kept = annotator.take().filter(|(of, _)| of == version);
+            let (_, annotator) =
+                annotator.insert(kept.unwrap_or_else(|| (version.clone(), Annotator::new(terrain.scene()))));
+            annotator.annotate(&mut offscreen, terrain, &drawn, &view.items, &look);
+        }
         let picture = if flight.reads || flight.pictures.is_some() {
             Some(offscreen.read()?)
         } else {

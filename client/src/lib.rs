@@ -16,6 +16,8 @@
 //! | [`terrain`] | one frame of streaming: cut, fetch, decode, cache |
 //! | [`drawing`] | what a frame draws, as plain data |
 //! | [`render`] | drawing + camera → pixels; the only module that knows the GPU |
+//! | [`globe`] | where the frame lies on the globe: longitudes, true north, true lengths |
+//! | [`annotate`] | scale bar, north arrow and legend over a picture |
 //! | [`picture`] | pixels → PNG |
 //! | [`overview`] | where a whole scene is seen from |
 //! | [`headless`] | pictures and flights without a window |
@@ -24,6 +26,7 @@
 //! | [`viewer`] | the terrain with a panel and a mouse; in a window |
 //! | `web` | the same on a page, in a browser |
 
+pub mod annotate;
 pub mod background;
 pub mod cache;
 pub mod camera;
@@ -34,6 +37,7 @@ pub mod doctor;
 pub mod drawing;
 pub mod encoding;
 pub mod fetch;
+pub mod globe;
 #[cfg(not(target_arch = "wasm32"))]
 pub mod headless;
 #[cfg(not(target_arch = "wasm32"))]

@@ -464,6 +464,25 @@ impl Terrain {
         }
     }
 
+    /// Seconds that points take to move where the level of detail changes, where the encoding has motions.
+    #[must_use]
+    pub fn morph_seconds(&self) -> f64 {
+        self.morph_seconds
+    }
+
+    /// Sets them, from 0 to [`morph::SECONDS_MAX`]; what is on its way jumps.
+    pub fn set_morph_seconds(&mut self, seconds: f64) {
+        self.morph_seconds = seconds.clamp(0.0, morph::SECONDS_MAX);
+        let of = |encoding| if encoding == Encoding::Points { self.morph_seconds } else { 0.0 };
+        self.options.morph_seconds = of(self.options.fetch.encoding);
+        if let Some(chosen) = &mut self.chosen {
+            chosen.morph_seconds = of(chosen.fetch.encoding);
+        }
+        for state in &mut self.layers {
+            state.morphs = Morphs::new(self.options.morph_seconds);
+        }
+    }
+
     /// Sets what heights are multiplied by; what is no number above 0 changes nothing.
     pub fn set_exaggeration(&mut self, exaggeration: f64) {
         if exaggeration > 0.0 && exaggeration.is_finite() {

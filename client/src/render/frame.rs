@@ -6,6 +6,7 @@
 //! Near the eye the differences are small, so `f32` holds them to a millionth of a cell.
 
 use super::look::{Background, Colours, Look};
+use super::ramp::{self, Quantity, Scale, linear};
 use super::view::View;
 use diamantina_protocol::message::{Kind, Layer};
 use glam::DVec3;
@@ -13,50 +14,8 @@ use glam::DVec3;
 /// Haze of a metre of air at height 0, for a haze of 1: 13 % at 10 km.
 const HAZE_PER_METRE: f32 = 1.4e-5;
 
-/// A colour of a ramp: where it stands, and sRGB as 0xRRGGBB.
-type Stop = (f32, u32);
-
-/// Land, lowest to highest: forest green, meadow, straw, ochre, brown, grey, white.
-const LAND: [Stop; 8] = [
-    (0.0, 0x3d_6e_4a),
-    (0.12, 0x62_8d_56),
-    (0.28, 0x9f_ad_6e),
-    (0.44, 0xcd_bd_88),
-    (0.60, 0xb8_9c_78),
-    (0.74, 0xa6_98_8d),
-    (0.87, 0xc8_c6_c5),
-    (1.0, 0xfa_fb_fd),
-];
-
-/// Bare rock and dust, lowest to highest.
-const ROCK: [Stop; 8] = [
-    (0.0, 0x4a_45_42),
-    (0.14, 0x5f_59_54),
-    (0.28, 0x77_6f_69),
-    (0.42, 0x8e_86_7f),
-    (0.56, 0xa5_9d_95),
-    (0.70, 0xbb_b3_aa),
-    (0.85, 0xd2_cb_c2),
-    (1.0, 0xec_e7_e0),
-];
-
-/// The sea, shallow to deep.
-const SEA: [Stop; 4] = [(0.0, 0xa9_d6_dd), (0.12, 0x62_ad_cc), (0.45, 0x2a_6c_a0), (1.0, 0x12_2f_5c)];
-
-/// The share of a layer's range of heights below 0 m that makes it a sea and not lowland or noise.
-const SEA_SHARE_MIN: f64 = 0.1;
-
-/// Summits up to here are hills, with no snow on them; from there on they are mountains, and white. Metres.
-const HILLS_TO_MOUNTAINS: [f64; 2] = [600.0, 3000.0];
-
-/// How far up the ramp of land the summits of hills reach.
-const HILLS: f64 = 0.62;
-
 const HORIZON: u32 = 0xd3_e0_ec;
 const ZENITH: u32 = 0x4f_80_bd;
-
-/// Water that mirrors nothing.
-const WATER: u32 = 0x4a_86_ab;
 
 /// The twin of `Frame`.
 #[repr(C)]
@@ -74,6 +33,7 @@ pub(super) struct FrameUniform {
     drape: [f32; 4],
     land: [[f32; 4]; 8],
     sea: [[f32; 4]; 4],
+    style: [f32; 4],
 }
 
 /// The twin of `Layer`.
@@ -120,40 +80,19 @@ impl Reference {
     pub(super) fn uniform(&self, layer: &Layer, eye: DVec3, look: &Look) -> LayerUniform {
         let offset = [0, 1].map(|i| layer.origin[i] + layer.cell[i] * self.lattice[i] as f64 - eye[i]);
         let height = self.height as f64 * layer.quantum + layer.height_offset;
-        let [lowest, highest] = layer.heights;
-        let ratio = |part: f64, range: f64| if range > 0.0 { single(part / range) } else { 0.0 };
-        let sea = has_sea(look.colours, layer.heights);
-        let land_base = if sea { lowest.max(0.0).min(highest) } else { lowest };
+        let scale = Scale::of(look, layer);
         LayerUniform {
             cell: layer.cell.map(single),
             offset: offset.map(single),
             quantum: single(layer.quantum * look.exaggeration),
             up_offset: single(height * look.exaggeration - eye.z),
             height: i32::try_from(self.height).unwrap_or(0),
-            per_depth: if sea { ratio(1.0, -lowest) } else { 0.0 },
-            land_base: single(land_base),
-            per_height: ratio(top(look.colours, highest), highest - land_base),
+            per_depth: single(scale.per_depth),
+            land_base: single(scale.base),
+            per_height: single(scale.per_value),
             exaggeration: single(look.exaggeration),
             is_water: f32::from(u8::from(layer.kind == Kind::Water)),
         }
-    }
-}
-
-/// Whether heights below 0 m are depths.
-fn has_sea(colours: Colours, [lowest, highest]: [f64; 2]) -> bool {
-    match colours {
-        Colours::Bathymetry => lowest < 0.0,
-        Colours::Auto => lowest < 0.0 && -lowest >= SEA_SHARE_MIN * (highest - lowest),
-        Colours::Terrain | Colours::Grey | Colours::Flat => false,
-    }
-}
-
-/// How far up the ramp the highest point stands: a low island has no snow.
-fn top(colours: Colours, highest: f64) -> f64 {
-    let [low, high] = HILLS_TO_MOUNTAINS;
-    match colours {
-        Colours::Grey => 1.0,
-        _ => HILLS + (1.0 - HILLS) * ((highest - low) / (high - low)).clamp(0.0, 1.0),
     }
 }
 
@@ -172,7 +111,7 @@ impl FrameUniform {
             Background::Sky => (colour(ZENITH, 0.0), false),
             Background::Colour(even) => (even, true),
         };
-        let [r, g, b] = linear(WATER);
+        let [r, g, b] = linear(ramp::WATER);
         Self {
             clip_from_eye: view.clip_from_eye(near).to_cols_array_2d(),
             right,
@@ -184,8 +123,14 @@ impl FrameUniform {
             options: [flag(encode), flag(look.show_levels), flag(look.colours == Colours::Flat), flag(even)],
             water: [r, g, b, single(view.lowest())],
             drape: [look.imagery.light, look.imagery.opacity, f32::from(anisotropy), 0.0],
-            land: if look.colours == Colours::Grey { ROCK } else { LAND }.map(|(at, srgb)| colour(srgb, at)),
-            sea: SEA.map(|(at, srgb)| colour(srgb, at)),
+            land: ramp::land(look.colours).map(|(at, srgb)| colour(srgb, at)),
+            sea: ramp::sea().map(|(at, srgb)| colour(srgb, at)),
+            style: [
+                f32::from(look.shading as u8),
+                flag(ramp::quantity(look.colours) == Quantity::Slope),
+                flag(ramp::shows_rock(look)),
+                look.haze.min(1.0),
+            ],
         }
     }
 }
@@ -194,15 +139,6 @@ impl FrameUniform {
 #[allow(clippy::cast_possible_truncation, reason = "rounding to f32 is the purpose")]
 pub(super) fn single(value: f64) -> f32 {
     value as f32
-}
-
-/// Linear red, green and blue of 0xRRGGBB.
-fn linear(srgb: u32) -> [f32; 3] {
-    let [_, r, g, b] = srgb.to_be_bytes();
-    [r, g, b].map(|byte| {
-        let c = f32::from(byte) / 255.0;
-        if c <= 0.040_45 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
-    })
 }
 
 #[cfg(test)]
@@ -289,43 +225,12 @@ mod tests {
 
     #[test]
     fn uniforms_have_the_layout_of_their_twins() {
-        let frame = twin!(FrameUniform: clip_from_eye right up forward sun horizon zenith options water drape land sea);
+        let frame = twin!(FrameUniform: clip_from_eye right up forward sun horizon zenith options water drape land sea style);
         assert_eq!(layout("Frame"), frame);
         let layer = twin!(LayerUniform: cell offset quantum up_offset height per_depth land_base per_height exaggeration is_water);
         assert_eq!(layout("Layer"), layer);
         assert_eq!(layout("Water"), twin!(WaterUniform: absorption body optics waves));
         let sizes = [size_of::<FrameUniform>(), size_of::<LayerUniform>(), size_of::<WaterUniform>()];
         assert!(sizes.iter().all(|s| s.is_multiple_of(16)), "WebGL2 wants it");
-    }
-
-    #[test]
-    fn colours_are_linear() {
-        assert_eq!(linear(0xff_00_ff), [1.0, 0.0, 1.0]);
-        assert!((linear(0x80_80_80)[0] - 0.215_86).abs() < 1e-4);
-    }
-
-    /// The Moon, the noise of a flat coast and a dry valley were drawn as seas.
-    #[test]
-    fn only_a_deep_part_is_sea() {
-        let sea = |heights| has_sea(Colours::Auto, heights);
-        for heights in
-            [[-2153.0, 1599.0], [-0.135, 0.125], [-30.0, 108.8], [-2339.0, -19.0], [-1431.0, 100.0]]
-        {
-            assert!(sea(heights), "{heights:?}");
-        }
-        for heights in
-            [[-3.0, 146.0], [-28.0, 1077.0], [-16.0, 3742.0], [-86.0, 3368.0], [0.0, 0.0], [5.0, 9.0]]
-        {
-            assert!(!sea(heights), "{heights:?}");
-        }
-        assert!(has_sea(Colours::Bathymetry, [-3.0, 146.0]) && !has_sea(Colours::Terrain, [-3e3, 1.0]));
-        assert_eq!([146.0, 4128.0].map(|h| top(Colours::Auto, h)), [HILLS, 1.0]);
-    }
-
-    #[test]
-    fn stops_rise() {
-        for ramp in [&LAND[..], &ROCK[..], &SEA[..]] {
-            assert!(ramp.is_sorted_by(|a, b| a.0 < b.0));
-        }
     }
 }

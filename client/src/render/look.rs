@@ -12,6 +12,11 @@ pub struct Look {
     pub sun: Sun,
     /// What terrain is coloured by.
     pub colours: Colours,
+    /// What the ends of the colours stand for, the lower below the upper: metres of height, or degrees of slope. Without
+    /// it each layer's own lowest and highest height, and 0 to 60 degrees.
+    pub range: Option<[f64; 2]>,
+    /// How terrain is lit.
+    pub shading: Shading,
     /// The thickness of the air: 0 is none, 1 a clear day.
     pub haze: f32,
     /// What heights are multiplied by; above 0. The camera's positions count in stretched heights.
@@ -24,6 +29,8 @@ pub struct Look {
     pub water: Water,
     /// How imagery looks.
     pub imagery: Imagery,
+    /// What is written over the finished picture. [`super::Renderer`] does not: see [`crate::annotate`].
+    pub annotations: Annotations,
 }
 
 impl Default for Look {
@@ -32,15 +39,21 @@ impl Default for Look {
             background: Background::Sky,
             sun: Sun::default(),
             colours: Colours::Auto,
+            range: None,
+            shading: Shading::Soft,
             haze: 1.0,
             exaggeration: 1.0,
             show_levels: false,
             wireframe: false,
             water: Water::default(),
             imagery: Imagery::default(),
+            annotations: Annotations::default(),
         }
     }
 }
+
+/// Behind pictures that show nothing but what was measured: paper.
+const PAPER: Background = Background::Colour([1.0; 4]);
 
 impl Look {
     /// How a scene looks unless told otherwise: other bodies than the Earth are grey, without air, and the sun
@@ -54,6 +67,23 @@ impl Look {
         let black = Background::Colour([0.003, 0.003, 0.004, 1.0]);
         let sun = Sun { altitude_degrees: 20.0, ..Sun::default() };
         Self { background: black, sun, colours: Colours::Grey, haze: 0.0, ..Self::default() }
+    }
+
+    /// The same without all that is only beautiful: on paper instead of under a sky, without haze, with heights as they
+    /// are, with colours of the ramp alone, lit by a formula or not at all, water in one colour, and imagery as it was taken. Sun, colours and
+    /// annotations stay.
+    #[must_use]
+    pub fn truthful(self) -> Self {
+        Self {
+            background: PAPER,
+            haze: 0.0,
+            exaggeration: 1.0,
+            show_levels: false,
+            shading: if self.shading == Shading::Soft { Shading::Hillshade } else { self.shading },
+            water: Water { reflecting: false, waves: 0.0, ..self.water },
+            imagery: Imagery { light: 0.0, ..self.imagery },
+            ..self
+        }
     }
 }
 
@@ -111,8 +141,50 @@ pub enum Colours {
     Bathymetry,
     /// Height, from dark to light grey: for bodies without plants and water.
     Grey,
-    /// Nothing: one grey.
+    /// Height, over the layer's range, from dark blue over green and orange to pink, even to the eye.
+    Batlow,
+    /// Height, from violet over green to yellow, even to the eye.
+    Viridis,
+    /// Height, from black over red to light yellow, even to the eye.
+    Magma,
+    /// The angle from the level, light to dark.
+    Slope,
+    /// Nothing: one grey; white where terrain is lit as by [`Shading::Hillshade`], whose light alone is seen then.
     Flat,
+}
+
+/// How terrain is lit. Their numbers are those that the shaders know.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Shading {
+    /// By the sun and the sky, with rock on steep ground: as a landscape.
+    Soft = 0,
+    /// By the cosine of the angle between the surface and the light, 0 where it is turned away: as `gdaldem hillshade`. The
+    /// encoded colour is multiplied by it, as programs of maps multiply two layers. Water is not lit.
+    Hillshade = 1,
+    /// Not at all: each pixel has its value's colour.
+    Unlit = 2,
+}
+
+/// What is written over pictures.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Annotations {
+    /// A bar of a round length, as it looks where the middle of the picture is.
+    pub scale_bar: bool,
+    /// An arrow to the north, as it lies on the level there.
+    pub north_arrow: bool,
+    /// What colours mean.
+    pub legend: bool,
+}
+
+impl Annotations {
+    /// All of them.
+    pub const ALL: Self = Self { scale_bar: true, north_arrow: true, legend: true };
+
+    /// Whether there is anything to write.
+    #[must_use]
+    pub fn is_any(self) -> bool {
+        self != Self::default()
+    }
 }
 
 /// How layers of water look.

@@ -3,12 +3,14 @@
 //! | module | what it holds |
 //! |---|---|
 //! | `look` | light, colours, water: what a caller may choose |
+//! | `ramp` | colours by value, for shaders and legends |
 //! | `frame` | the uniforms, and how positions stay exact far from the origin |
 //! | `view` | where a pass draws from: the eye, or its mirror image |
 //! | `pipelines` | how vertices become pixels |
 //! | `resident` | surfaces on the GPU, under a budget |
 //! | `drape` | imagery on terrain |
 //! | `water` | what is mirrored in water and seen through it |
+//! | `overlay` | what egui draws over a picture: the panel, annotations |
 //! | `offscreen` | pictures without a window |
 //!
 //! A diamond is one or two draws: its points at their own buffer, its place and axes as an instance, the
@@ -21,7 +23,9 @@ mod frame;
 mod look;
 #[cfg(not(target_arch = "wasm32"))]
 mod offscreen;
+mod overlay;
 mod pipelines;
+mod ramp;
 mod resident;
 mod view;
 mod water;
@@ -29,9 +33,11 @@ mod water;
 #[cfg(test)]
 mod tests;
 
-pub use look::{Background, Colours, Imagery, Look, Sun, Water};
+pub use look::{Annotations, Background, Colours, Imagery, Look, Shading, Sun, Water};
 #[cfg(not(target_arch = "wasm32"))]
 pub use offscreen::Offscreen;
+pub(crate) use overlay::Overlay;
+pub use ramp::{Quantity, Scale, water_colour};
 
 use crate::camera::{Bounds, Camera, nearest_drawn};
 use crate::drawing::DrawItem;
@@ -41,6 +47,7 @@ use diamantina_protocol::message::{self, Layer};
 use drape::{Drapes, Start};
 use frame::{FrameUniform, LayerUniform, Reference, single};
 use pipelines::{Kind, Mode, Pipelines, Target, sky_pipeline, terrain_pipelines};
+use ramp::encoded;
 use resident::{Residents, Triangles};
 use std::ops::Range;
 use view::View;
@@ -658,11 +665,6 @@ fn clear_colour(look: &Look, format: wgpu::TextureFormat) -> wgpu::Color {
     };
     let [r, g, b] = [0, 1, 2].map(|i| if format.is_srgb() { clear[i] } else { encoded(clear[i]) });
     wgpu::Color { r, g, b, a: clear[3] }
-}
-
-/// The sRGB curve, for a clear colour on a target that stores colours as they are.
-fn encoded(linear: f64) -> f64 {
-    if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
 }
 
 fn layer_group(

@@ -1,16 +1,22 @@
 //! Pictures without a window.
 
-use super::{BACKENDS, FrameStats, Look, Options, RenderError, Renderer, device, fit, instance};
+use super::{BACKENDS, FrameStats, Look, Options, Overlay, RenderError, Renderer, device, fit, instance};
 use crate::camera::Camera;
 use crate::drawing::DrawItem;
 use crate::picture::Picture;
 use crate::texture::Drape;
 use diamantina_protocol::message::Layer;
+use egui::{Context, Painter, Pos2, RawInput, Rect, Vec2, ViewportId};
+
+/// The target's format where what is drawn over the picture mixes colours: the same bytes, as they are.
+const PLAIN: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
 
 /// A renderer with a target of its own, as large as the last picture.
 pub struct Offscreen {
     renderer: Renderer,
     target: Option<wgpu::Texture>,
+    /// Made when something is first drawn over a picture.
+    overlay: Option<(Context, Overlay)>,
 }
 
 impl Offscreen {
@@ -23,7 +29,7 @@ impl Offscreen {
         let found = async { device(&instance(BACKENDS).await, None, "offscreen").await };
         let (adapter, device, queue) = pollster::block_on(found)?;
         let options = Options { format: wgpu::TextureFormat::Rgba8UnormSrgb, ..fit(options, &adapter) };
-        Ok(Self { renderer: Renderer::new(device, queue, &options), target: None })
+        Ok(Self { renderer: Renderer::new(device, queue, &options), target: None, overlay: None })
     }
 
     /// See [`Renderer::drape`].
@@ -57,12 +63,36 @@ impl Offscreen {
                 dimension: wgpu::TextureDimension::D2,
                 format: wgpu::TextureFormat::Rgba8UnormSrgb,
                 usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::COPY_SRC,
-                view_formats: &[],
+                view_formats: &[PLAIN],
             }),
         };
         let view = target.create_view(&wgpu::TextureViewDescriptor::default());
         self.target = Some(target);
         Ok(self.renderer.draw(layers, camera, items, look, &view))
+    }
+
+    /// Draws over the picture last drawn, if there is one, with egui. `pixels_per_point`: how large its points are. `draw`
+    /// gets the picture's extent in points.
+    pub fn draw_over(&mut self, pixels_per_point: f32, mut draw: impl FnMut(&Painter, Rect)) {
+        let Some(target) = &self.target else { return };
+        let (device, queue) = (self.renderer.device(), self.renderer.queue());
+        let (context, overlay) =
+            self.overlay.get_or_insert_with(|| (Context::default(), Overlay::new(device, PLAIN, true)));
+        let size = [target.width(), target.height()];
+        let [width, height] = size.map(|pixels| pixels as f32 / pixels_per_point);
+        let mut input = RawInput {
+            screen_rect: Some(Rect::from_min_size(Pos2::ZERO, Vec2::new(width, height))),
+            max_texture_side: usize::try_from(device.limits().max_texture_dimension_2d).ok(),
+            ..RawInput::default()
+        };
+        let viewport = input.viewports.entry(ViewportId::ROOT).or_default();
+        viewport.native_pixels_per_point = Some(pixels_per_point);
+        let output = context.run_ui(input, |ui| draw(ui.painter(), ui.max_rect()));
+        let shapes = overlay.take(device, queue, context, output);
+        let view =
+            target.create_view(&wgpu::TextureViewDescriptor { format: Some(PLAIN), ..Default::default() });
+        overlay.paint(device, queue, &view, size, &shapes);
+        overlay.end(shapes);
     }
 
     /// Waits until the GPU is done with all that was drawn.

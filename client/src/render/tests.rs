@@ -8,6 +8,7 @@
 )]
 
 mod motion;
+mod truth;
 mod water;
 
 use super::pipelines::RECORD;
@@ -36,6 +37,8 @@ const PLAIN: Look = Look {
     background: MAGENTA,
     sun: Sun { azimuth_degrees: 315.0, altitude_degrees: 45.0 },
     colours: Colours::Terrain,
+    range: None,
+    shading: Shading::Soft,
     haze: 0.0,
     exaggeration: 1.0,
     show_levels: false,
@@ -49,6 +52,7 @@ const PLAIN: Look = Look {
         mirror_scale: 1.0,
     },
     imagery: Imagery { light: 0.0, opacity: 1.0 },
+    annotations: Annotations { scale_bar: false, north_arrow: false, legend: false },
 };
 
 /// A layer with all surfaces of its forest, decoded from payloads as a client does.

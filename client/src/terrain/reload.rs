@@ -139,7 +139,9 @@ impl Terrain {
     /// Goes on as another version. What was counted counts on.
     fn become_next(&mut self, mut next: Self) {
         next.opened = self.opened;
-        next.morph_seconds = self.morph_seconds;
+        if next.morph_seconds != self.morph_seconds {
+            next.set_morph_seconds(self.morph_seconds);
+        }
         next.traffic_before = self.traffic_before.plus(&self.fetcher.traffic());
         next.stats.reloads = self.stats.reloads + 1;
         next.stats.first_picture_seconds = self.stats.first_picture_seconds;

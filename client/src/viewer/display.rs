@@ -1,8 +1,7 @@
 //! A window, or a canvas, and what draws the viewer on it.
 
 use super::Viewer;
-use crate::render::{self, RenderError, Renderer};
-use egui_wgpu::{RendererOptions, ScreenDescriptor};
+use crate::render::{self, Overlay, RenderError, Renderer};
 use std::sync::Arc;
 use std::time::Duration;
 use winit::dpi::PhysicalSize;
@@ -19,7 +18,7 @@ pub(crate) struct Display {
     configuration: wgpu::SurfaceConfiguration,
     renderer: Renderer,
     input: egui_winit::State,
-    painter: egui_wgpu::Renderer,
+    overlay: Overlay,
     #[cfg(target_arch = "wasm32")]
     backend: wgpu::Backend,
 }
@@ -49,7 +48,7 @@ impl Display {
         let plain = formats.iter().copied().find(|format| !format.is_srgb());
         configuration.format = plain.unwrap_or(configuration.format);
         surface.configure(&device, &configuration);
-        let painter = egui_wgpu::Renderer::new(&device, configuration.format, RendererOptions::default());
+        let overlay = Overlay::new(&device, configuration.format, false);
         let context = egui::Context::default();
         let (view, side) = (egui::ViewportId::ROOT, usize::try_from(limit).ok());
         let input = egui_winit::State::new(context, view, &window, None, None, side);
@@ -61,7 +60,7 @@ impl Display {
             configuration,
             renderer,
             input,
-            painter,
+            overlay,
             #[cfg(target_arch = "wasm32")]
             backend: adapter.get_info().backend,
         })
@@ -127,57 +126,27 @@ impl Display {
         }
     }
 
-    /// Draws a frame, with the panel or without; how long until the next is wanted.
+    /// Draws a frame, with the panel or, for a picture, without; how long until the next is wanted.
     pub(crate) fn draw(&mut self, viewer: &mut Viewer, with_panel: bool) -> Duration {
         viewer.resize([self.configuration.width, self.configuration.height]);
         let input = self.input.take_egui_input(&self.window);
         let context = self.input.egui_ctx().clone();
-        let mut output = context.run_ui(input, |ui| viewer.update(ui));
-        self.input.handle_platform_output(&self.window, output.platform_output);
+        let mut output = context.run_ui(input, |ui| viewer.frame_of(ui, with_panel));
+        self.input.handle_platform_output(&self.window, std::mem::take(&mut output.platform_output));
         let repaint = output.viewport_output.get(&egui::ViewportId::ROOT).map(|view| view.repaint_delay);
-        let shapes = context.tessellate(output.shapes, output.pixels_per_point);
-        for (id, changes) in output.textures_delta.set.drain() {
-            for change in &changes {
-                self.painter.update_texture(self.renderer.device(), self.renderer.queue(), id, change);
-            }
-        }
+        let shapes = self.overlay.take(self.renderer.device(), self.renderer.queue(), &context, output);
         if let Some(texture) = self.texture() {
             let view = texture.texture.create_view(&wgpu::TextureViewDescriptor::default());
             let layers = &viewer.terrain().scene().layers;
             self.renderer.drape(viewer.drape());
             let drawn = self.renderer.draw(layers, viewer.camera(), &viewer.items(), viewer.look(), &view);
-            if with_panel {
-                self.paint(&view, &shapes, output.pixels_per_point);
-            }
+            let size = [self.configuration.width, self.configuration.height];
+            self.overlay.paint(self.renderer.device(), self.renderer.queue(), &view, size, &shapes);
             viewer.note(drawn);
             self.window.pre_present_notify();
             self.renderer.queue().present(texture);
         }
-        for id in output.textures_delta.free.drain() {
-            self.painter.free_texture(&id);
-        }
+        self.overlay.end(shapes);
         repaint.unwrap_or(IDLE).min(IDLE)
-    }
-
-    /// Draws the panel over the terrain.
-    fn paint(&mut self, view: &wgpu::TextureView, shapes: &[egui::ClippedPrimitive], pixels_per_point: f32) {
-        let (device, queue) = (self.renderer.device(), self.renderer.queue());
-        let size_in_pixels = [self.configuration.width, self.configuration.height];
-        let screen = ScreenDescriptor { size_in_pixels, pixels_per_point };
-        let mut encoder = device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
-        let mut commands = self.painter.update_buffers(device, queue, &mut encoder, shapes, &screen);
-        let pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
-            label: Some("panel"),
-            color_attachments: &[Some(wgpu::RenderPassColorAttachment {
-                view,
-                depth_slice: None,
-                resolve_target: None,
-                ops: wgpu::Operations { load: wgpu::LoadOp::Load, store: wgpu::StoreOp::Store },
-            })],
-            ..Default::default()
-        });
-        self.painter.render(&mut pass.forget_lifetime(), shapes, &screen);
-        commands.push(encoder.finish());
-        queue.submit(commands);
     }
 }

@@ -1,8 +1,6 @@
 //! What was clicked: places on the ground, and the profile between the last two.
 
 use super::Viewer;
-use diamantina_protocol::message::Frame;
-use diamantina_protocol::projection::Projection;
 use egui::{Align2, FontId, RichText, Stroke, Ui};
 use glam::DVec3;
 
@@ -23,31 +21,6 @@ pub struct Mark {
     pub error: Option<f64>,
     /// The layer.
     pub layer: usize,
-}
-
-/// Where the frame lies on the globe.
-#[derive(Debug)]
-pub(super) struct Globe {
-    projection: Projection,
-    origin: [f64; 2],
-    per_metre: [f64; 2],
-}
-
-impl Globe {
-    /// `None` if that is not known.
-    pub(super) fn of(frame: &Frame) -> Option<Self> {
-        let crs = frame.crs.as_ref()?;
-        let projection = Projection::new(crs.proj4.as_deref()?).ok()?;
-        Some(Self { projection, origin: crs.origin, per_metre: crs.per_metre })
-    }
-
-    /// Longitude, from -180 to 180, and latitude in degrees of a place in the frame's metres.
-    pub(super) fn lonlat(&self, place: DVec3) -> Option<[f64; 2]> {
-        let [x, y] = [0, 1].map(|i| self.origin[i] + place[i] * self.per_metre[i]);
-        let (lon, lat) = self.projection.inverse(x, y)?;
-        let lon = if (-180.0..=180.0).contains(&lon) { lon } else { (lon + 180.0).rem_euclid(360.0) - 180.0 };
-        Some([lon, lat])
-    }
 }
 
 /// The ground between the last two marks.
@@ -186,23 +159,8 @@ fn plot(profile: &Profile, ui: &mut Ui) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use diamantina_protocol::message::Crs;
-
     #[test]
-    fn places_have_longitudes_where_the_frame_has() {
-        let crs = |proj4: &str, per_metre| Crs {
-            name: "made".into(),
-            proj4: Some(proj4.into()),
-            origin: [500_000.0, 5_000_000.0],
-            per_metre: [per_metre; 2],
-        };
-        let frame = |crs| Frame { crs, vertical_unit: "metre".into() };
-        assert!(Globe::of(&frame(None)).is_none());
-        assert!(Globe::of(&frame(Some(crs("+proj=nonsense", 1.0)))).is_none());
-        // The central meridian of zone 32.
-        let globe = Globe::of(&frame(Some(crs("+proj=utm +zone=32 +datum=WGS84", 1.0)))).unwrap();
-        let [lon, lat] = globe.lonlat(DVec3::ZERO).unwrap();
-        assert!((lon - 9.0).abs() < 1e-9 && (45.0..45.3).contains(&lat), "{lon} {lat}");
+    fn degrees_are_written_as_on_maps() {
         assert_eq!(degrees(-9.5, -45.25), "45.250000° S, 9.500000° W");
     }
 

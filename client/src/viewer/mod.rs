@@ -3,6 +3,7 @@
 //! | module | what it holds |
 //! |---|---|
 //! | `panel` | sliders, choices, figures, and what was clicked |
+//! | `truth` | the switch that shows nothing but what was measured |
 //! | `display` | a window or a canvas, and what draws on it |
 //! | [`window`] | a native window: events in, pictures out |
 //!
@@ -20,15 +21,18 @@ mod measure;
 mod panel;
 #[cfg(not(target_arch = "wasm32"))]
 mod shelf;
+mod truth;
 #[cfg(not(target_arch = "wasm32"))]
 pub mod window;
 
 pub use bookmarks::{Bookmark, read as read_bookmarks};
 pub use measure::Mark;
 
+use crate::annotate::{self, Subject};
 use crate::camera::Camera;
 use crate::controls::{self, Controls, Thrust};
 use crate::drawing::DrawItem;
+use crate::globe::Globe;
 use crate::overview;
 use crate::pick::{Hit, Picker, Ray};
 use crate::render::{FrameStats, Look};
@@ -36,11 +40,12 @@ use crate::terrain::{FrameView, Terrain};
 use crate::texture::Drape;
 use bookmarks::Bookmarks;
 use diamantina_protocol::message::Kind;
-use egui::{Event, Key, Modifiers, PointerButton, Sense, Ui};
+use egui::{Event, Key, Modifiers, Painter, PointerButton, Rect, Sense, Ui};
 use glam::{DVec2, DVec3};
-use measure::{Globe, Profile};
+use measure::Profile;
 use panel::History;
 use std::path::PathBuf;
+use truth::Untrue;
 
 /// Radians that the view turns for a point (of 1/96 inch, about) of a drag.
 const TURN_PER_POINT: f64 = 0.005;
@@ -57,10 +62,16 @@ const CLEARANCE_CELLS: f64 = 0.5;
 /// ... and the least distance to what it zooms to.
 const NEAREST_CELLS: f64 = 3.0;
 
+/// Seconds that points move, where nothing else was asked for.
+const MORPH_SECONDS: f64 = 0.3;
+
+/// Points at the window's lower side that messages take.
+const MESSAGE_POINTS: f32 = 26.0;
+
 /// What whoever shows the viewer is asked to do.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Ask {
-    /// To save a picture of the terrain, without the panel.
+    /// To save a picture of the terrain with its annotations, without the panel.
     Screenshot(PathBuf),
     /// To put a text on the clipboard.
     Copy(String),
@@ -79,6 +90,8 @@ pub struct Viewer {
     home: Camera,
     picker: Picker,
     look: Look,
+    /// What is beautiful and not shown, while nothing but what was measured is.
+    untrue: Option<Untrue>,
     frame: FrameView,
     /// What is drawn while the cut stands still.
     frozen: Option<Vec<DrawItem>>,
@@ -112,6 +125,7 @@ impl Viewer {
             url: url.to_owned(),
             picker: Picker::default(),
             look,
+            untrue: None,
             frame: FrameView::default(),
             frozen: None,
             grabbed: None,
@@ -228,8 +242,15 @@ impl Viewer {
 
     /// One frame: the panel, what keys and mouse do, and what the terrain shows then. Never waits.
     pub fn update(&mut self, ui: &mut Ui) {
+        self.frame_of(ui, true);
+    }
+
+    /// The same; without the panel and all that is no part of a picture, where one is taken.
+    pub(crate) fn frame_of(&mut self, ui: &mut Ui, with_panel: bool) {
         let seconds = f64::from(ui.input(|input| input.stable_dt)).min(0.1);
-        panel::show(self, ui);
+        if with_panel {
+            panel::show(self, ui);
+        }
         self.switch_panel(ui);
         self.steer(ui, seconds);
         self.controls.step(seconds);
@@ -253,9 +274,13 @@ impl Viewer {
             }
         }
         measure::follow(self);
-        if self.shows_boxes {
+        if self.shows_boxes && with_panel {
             boxes::show(self, ui);
         }
+        // Above the message at the lower left, beside the panel.
+        let mut area = ui.available_rect_before_wrap();
+        area.max.y -= if with_panel { MESSAGE_POINTS } else { 0.0 };
+        self.annotate(ui.painter(), area);
         self.history.note(seconds, &self.frame);
         let has_waves = self.has_waves();
         if has_waves {
@@ -264,6 +289,21 @@ impl Viewer {
         if !self.frame.complete || self.frame.moving > 0 || self.controls.is_gliding() || has_waves {
             ui.ctx().request_repaint();
         }
+    }
+
+    /// Writes over the picture what the look asks for, within an area in points.
+    pub(crate) fn annotate(&mut self, painter: &Painter, area: Rect) {
+        if !self.look.annotations.is_any() {
+            return;
+        }
+        let camera = self.controls.camera();
+        let items = self.items();
+        let layers = &self.terrain.scene().layers;
+        let centre = annotate::centre(&mut self.picker, layers, &items, &self.look, camera);
+        let layers = self.terrain.shown_scene().layers;
+        let globe = self.globe.as_ref();
+        let subject = Subject { camera, look: &self.look, layers: &layers, globe, centre };
+        annotate::show(painter, area, &subject);
     }
 
     /// Forgets what was of the version of the scene before: layers may be others now, and lie elsewhere.

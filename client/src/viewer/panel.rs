@@ -2,14 +2,26 @@
 
 use super::{Ask, Viewer, bookmarks, measure};
 use crate::encoding::Encoding;
-use crate::render::{Background, Colours};
+use crate::render::{Background, Colours, Shading};
 use crate::terrain::FrameView;
 use diamantina_protocol::message::Kind;
-use egui::{Color32, ComboBox, Frame, Panel, RichText, ScrollArea, Slider, Stroke, Ui};
+use egui::{Checkbox, Color32, ComboBox, Frame, Panel, RichText, ScrollArea, Slider, Stroke, Ui};
 use std::collections::VecDeque;
 
 /// Frames that the plots show.
 const HISTORY: usize = 240;
+
+const COLOURS: [Colours; 9] = [
+    Colours::Auto,
+    Colours::Terrain,
+    Colours::Bathymetry,
+    Colours::Grey,
+    Colours::Batlow,
+    Colours::Viridis,
+    Colours::Magma,
+    Colours::Slope,
+    Colours::Flat,
+];
 
 /// What has been seen frame by frame.
 #[derive(Debug, Default)]
@@ -58,6 +70,7 @@ pub(super) fn show(viewer: &mut Viewer, ui: &mut Ui) {
             view(viewer, ui);
             light(viewer, ui);
             water(viewer, ui);
+            annotations(viewer, ui);
             heading(ui, "Clicked");
             measure::show(viewer, ui);
             heading(ui, "Bookmarks");
@@ -111,8 +124,14 @@ fn view(viewer: &mut Viewer, ui: &mut Ui) {
     if ui.add(Slider::new(&mut pixels, 0.25..=32.0).logarithmic(true).text("error [px]")).changed() {
         viewer.terrain.set_tolerance_pixels(pixels);
     }
+    let mut is_true = viewer.is_true();
+    let told = "Nothing but what was measured: no sky, haze, waves, mirrors, motions or exaggeration; colours of the ramp alone";
+    if ui.checkbox(&mut is_true, "true").on_hover_text(told).changed() {
+        viewer.set_true(is_true);
+    }
     let mut exaggeration = viewer.look.exaggeration;
-    if ui.add(Slider::new(&mut exaggeration, 0.1..=20.0).logarithmic(true).text("exaggeration")).changed() {
+    let slider = Slider::new(&mut exaggeration, 0.1..=20.0).logarithmic(true).text("exaggeration");
+    if ui.add_enabled(!is_true, slider).changed() {
         viewer.set_exaggeration(exaggeration);
     }
     streaming(viewer, ui);
@@ -122,15 +141,31 @@ fn view(viewer: &mut Viewer, ui: &mut Ui) {
         Colours::Terrain => "terrain",
         Colours::Bathymetry => "terrain and sea",
         Colours::Grey => "grey by height",
-        Colours::Flat => "one grey",
+        Colours::Batlow => "batlow by height",
+        Colours::Viridis => "viridis by height",
+        Colours::Magma => "magma by height",
+        Colours::Slope => "slope",
+        Colours::Flat => "none: light alone",
     };
     ComboBox::from_label("colours").selected_text(name(viewer.look.colours)).show_ui(ui, |ui| {
-        for colours in [Colours::Auto, Colours::Terrain, Colours::Bathymetry, Colours::Grey, Colours::Flat] {
+        for colours in COLOURS {
             ui.selectable_value(&mut viewer.look.colours, colours, name(colours));
         }
     });
+    let name = |shading: Shading| match shading {
+        Shading::Soft => "sun and sky",
+        Shading::Hillshade => "hillshade",
+        Shading::Unlit => "none: colours to be read",
+    };
+    ComboBox::from_label("shading").selected_text(name(viewer.look.shading)).show_ui(ui, |ui| {
+        for shading in [Shading::Soft, Shading::Hillshade, Shading::Unlit] {
+            if shading != Shading::Soft || !is_true {
+                ui.selectable_value(&mut viewer.look.shading, shading, name(shading));
+            }
+        }
+    });
     ui.checkbox(&mut viewer.look.wireframe, "wireframe");
-    ui.checkbox(&mut viewer.look.show_levels, "levels as colours");
+    ui.add_enabled(!is_true, Checkbox::new(&mut viewer.look.show_levels, "levels as colours"));
     ui.checkbox(&mut viewer.shows_boxes, "bounding boxes");
     let mut is_frozen = viewer.frozen.is_some();
     if ui.checkbox(&mut is_frozen, "freeze what is drawn").changed() {
@@ -206,9 +241,10 @@ fn water(viewer: &mut Viewer, ui: &mut Ui) {
         return;
     }
     heading(ui, "Water");
+    let is_true = viewer.is_true();
     let water = &mut viewer.look.water;
-    ui.checkbox(&mut water.reflecting, "mirrors, and shows its bed");
-    ui.add_enabled_ui(water.reflecting, |ui| {
+    ui.add_enabled(!is_true, Checkbox::new(&mut water.reflecting, "mirrors, and shows its bed"));
+    ui.add_enabled_ui(water.reflecting && !is_true, |ui| {
         ui.add(Slider::new(&mut water.waves, 0.0..=3.0).text("waves"));
         let mut clarity = water.clarity.unwrap_or_default();
         let told = if water.clarity.is_some() { "clear to [m]" } else { "clear as fits" };
@@ -223,14 +259,24 @@ fn water(viewer: &mut Viewer, ui: &mut Ui) {
     });
 }
 
+/// What is written over the picture, and over those that are saved.
+fn annotations(viewer: &mut Viewer, ui: &mut Ui) {
+    heading(ui, "Written over the picture");
+    let annotations = &mut viewer.look.annotations;
+    ui.checkbox(&mut annotations.scale_bar, "scale bar").on_hover_text("As long as it is at the cross");
+    ui.checkbox(&mut annotations.north_arrow, "north arrow").on_hover_text("As it lies on the level there");
+    ui.checkbox(&mut annotations.legend, "legend");
+}
+
 fn light(viewer: &mut Viewer, ui: &mut Ui) {
     heading(ui, "Light");
+    let is_true = viewer.is_true();
     let sun = &mut viewer.look.sun;
     ui.add(Slider::new(&mut sun.azimuth_degrees, 0.0..=360.0).text("sun from [°]"));
     ui.add(Slider::new(&mut sun.altitude_degrees, 0.0..=90.0).text("sun above [°]"));
-    ui.add(Slider::new(&mut viewer.look.haze, 0.0..=4.0).text("haze"));
+    ui.add_enabled(!is_true, Slider::new(&mut viewer.look.haze, 0.0..=4.0).text("haze"));
     let mut has_sky = viewer.look.background == Background::Sky;
-    if ui.checkbox(&mut has_sky, "sky").changed() {
+    if ui.add_enabled(!is_true, Checkbox::new(&mut has_sky, "sky")).changed() {
         viewer.look.background =
             if has_sky { Background::Sky } else { Background::Colour([0.003, 0.003, 0.004, 1.0]) };
     }

@@ -397,3 +397,57 @@ fn nothing_of_a_scene_before_outlives_it() {
     assert!(hand.viewer.marks().is_empty() && hand.viewer.frozen.is_none());
     assert!(!hand.viewer.items().is_empty(), "its layers are seen");
 }
+
+#[test]
+fn the_true_view_is_plain_and_can_be_left_again() {
+    let mut hand = Hand::new(Some(looking_down()));
+    hand.viewer.set_exaggeration(3.0);
+    hand.viewer.terrain.set_morph_seconds(0.3);
+    let (before, eye) = (*hand.viewer.look(), hand.camera().eye);
+    assert!(!hand.viewer.is_true());
+    hand.viewer.set_true(true);
+    let look = *hand.viewer.look();
+    assert!(hand.viewer.is_true() && look.exaggeration == 1.0 && look.haze == 0.0, "{look:?}");
+    assert!(!look.water.reflecting && look.background != crate::render::Background::Sky, "{look:?}");
+    assert_eq!(hand.viewer.terrain.morph_seconds(), 0.0);
+    assert!((hand.camera().eye.z * 3.0 - eye.z).abs() < 1e-6, "the view stays");
+    hand.settle();
+    hand.viewer.look.colours = crate::render::Colours::Slope;
+    hand.viewer.set_true(false);
+    let expected = Look { colours: crate::render::Colours::Slope, ..before };
+    assert_eq!((*hand.viewer.look(), hand.viewer.terrain.morph_seconds()), (expected, 0.3));
+    assert!((hand.camera().eye - eye).length() < 1e-6);
+}
+
+#[test]
+fn the_panel_writes_over_the_picture() {
+    let mut hand = Hand::new(Some(looking_down()));
+    let texts = |hand: &mut Hand, with_panel: bool| -> Vec<(String, Pos2)> {
+        let input = RawInput {
+            screen_rect: Some(Rect::from_min_size(Pos2::ZERO, vec2(SIZE[0] as f32, SIZE[1] as f32))),
+            time: Some(hand.seconds + 1.0),
+            ..RawInput::default()
+        };
+        let viewer = &mut hand.viewer;
+        let output = hand.context.run_ui(input, |ui| viewer.frame_of(ui, with_panel));
+        let texts = output.shapes.iter().filter_map(|s| match &s.shape {
+            egui::Shape::Text(text) => Some((text.galley.text().to_owned(), text.pos)),
+            _ => None,
+        });
+        let texts = texts.collect();
+        output.drop_without_applying_deltas();
+        texts
+    };
+    let find = |texts: &[(String, Pos2)], text: &str| {
+        texts.iter().find(|(found, _)| found == text).map(|(_, at)| *at)
+    };
+    assert!(find(&texts(&mut hand, true), "Height [m]").is_none());
+    hand.viewer.look.annotations = crate::render::Annotations::ALL;
+    let beside = texts(&mut hand, true);
+    let legend = find(&beside, "Height [m]").unwrap();
+    assert!(find(&beside, "N").is_some() && find(&beside, "View").unwrap().x > legend.x, "left of the panel");
+    // In a picture there is no panel, and it goes to the side.
+    let alone = texts(&mut hand, false);
+    assert!(find(&alone, "Height [m]").unwrap().x > legend.x && find(&alone, "View").is_none());
+    assert!(alone.iter().any(|(text, _)| text.starts_with("at the cross (") && !text.contains("no ground")));
+}

@@ -4,7 +4,7 @@ use super::display::{Display, IDLE};
 use super::shelf::Shelf;
 use super::{Ask, Viewer};
 use crate::render::{self, Offscreen, RenderError};
-use crate::{headless, picture};
+use crate::{annotate, headless, picture};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
@@ -96,12 +96,19 @@ impl Shown {
         }
     }
 
-    /// Saves a picture of the terrain as it is drawn now, without the panel.
-    fn photograph(&self, path: &Path) -> Result<(), headless::HeadlessError> {
-        let mut offscreen = Offscreen::new(&self.options)?;
+    /// Saves a picture of the terrain as it is drawn now, with its annotations, without the panel.
+    fn photograph(&mut self, path: &Path) -> Result<(), headless::HeadlessError> {
+        let samples = if self.viewer.is_true() { 1 } else { self.options.samples };
+        let mut offscreen = Offscreen::new(&render::Options { samples, ..self.options })?;
         let layers = &self.viewer.terrain().scene().layers;
         offscreen.drape(self.viewer.drape());
         offscreen.draw(layers, self.viewer.camera(), &self.viewer.items(), self.viewer.look())?;
+        let size = self.viewer.camera().size;
+        if self.viewer.look().annotations.is_any() {
+            offscreen.draw_over(annotate::pixels_per_point(size), |painter, area| {
+                self.viewer.annotate(painter, area);
+            });
+        }
         let picture: picture::Picture = offscreen.read()?;
         headless::save(&picture, path)
     }
