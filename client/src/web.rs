@@ -111,6 +111,7 @@ fn options(address: &Address) -> Result<terrain::Options, String> {
     Ok(terrain::Options {
         tolerance_pixels,
         memory_bytes: MEMORY_BYTES,
+        gpu_bytes: GPU_BYTES,
         morph_seconds: if encoding == Encoding::Points { MORPH_SECONDS } else { 0.0 },
         layers: address.asked("layer").map(|names| names.split(',').map(str::to_owned).collect()),
         zone: address.asked("zone"),

@@ -5,6 +5,7 @@ use super::http::{Http, PAGE_BYTES_MAX, count, decode_page, good_payload, pause,
 use super::stream::weight;
 use super::{Event, FetchError, Key, REST, TRIES_MAX, Want};
 use crate::background::within;
+use crate::disk::Shelf;
 use crate::encoding::Encoding;
 use bytes::Bytes;
 use diamantina_protocol::bintree::Forest;
@@ -26,6 +27,8 @@ pub(super) struct Shared {
     /// Those of the layers' points.
     pub(super) forests: Vec<Forest>,
     pub(super) requests_max: usize,
+    /// What was fetched before.
+    pub(super) shelf: Option<Shelf>,
     // A std Mutex: nothing awaits while it is held, nor does more than look through the wishes.
     pub(super) state: Mutex<State>,
     pub(super) changed: Notify,
@@ -47,6 +50,10 @@ pub(super) struct State {
     /// What arrived, with the number of its event, until the frame has seen it.
     pub(super) delivered: HashMap<Key, u64, RandomState>,
     pub(super) failures: HashMap<Key, Failure, RandomState>,
+    /// Whether requests end at the disk, and why.
+    pub(super) away: Option<String>,
+    /// When the first of the requests failed that have not reached the server.
+    pub(super) silent_since: Option<Instant>,
     /// Events and requests so far.
     serial: u64,
     flight: u64,
@@ -61,12 +68,14 @@ pub(super) struct Flight {
     pub(super) stream: Option<usize>,
     /// Whether something of it has arrived.
     useful: bool,
+    /// Whether it has gone to the network.
+    pub(super) is_out: bool,
 }
 
 #[derive(Debug)]
 pub(super) struct Failure {
     pub(super) tries: u32,
-    not_before: Instant,
+    pub(super) not_before: Instant,
 }
 
 /// What a task does next.
@@ -75,13 +84,18 @@ enum Next {
     Wait(Option<Instant>),
 }
 
-enum Request {
+pub(super) enum Request {
     Page(usize, u32),
     Batch(usize, Vec<(Diamond, Option<u32>)>),
     Stream(usize, StreamAsk),
 }
 
 impl State {
+    /// Where nothing has been wished for yet.
+    pub(super) fn new(away: Option<String>) -> Self {
+        Self { away, ..Self::default() }
+    }
+
     /// Drops the streams of some layers.
     pub(super) fn end_streams(&mut self, of: impl Fn(usize) -> bool) {
         self.streams.retain(|(layer, _)| !of(*layer));
@@ -110,7 +124,7 @@ pub(super) async fn work(shared: Arc<Shared>) {
             }
             Next::Fetch { id, cancel, request } => {
                 let done = tokio::select! {
-                    done = shared.fetch(&request) => Some(done),
+                    done = shared.fetch(id, &request) => Some(done),
                     () = cancel.notified() => None,
                 };
                 let gone = matches!(&done, Some(Err(FetchError::Status { status: 404 | 410, .. })));
@@ -187,9 +201,6 @@ impl Shared {
             (_, Some(batch), None) => Request::Batch(batch.layer, batch.wants),
             _ => return Next::Wait(soonest),
         };
-        if state.flights.is_empty() {
-            count(&self.http.traffic.round_trips, 1);
-        }
         state.flight += 1;
         let id = state.flight;
         match &request {
@@ -204,22 +215,37 @@ impl Shared {
         let cancel = Arc::new(Notify::new());
         let is_page = matches!(request, Request::Page(..));
         let stream = if let Request::Stream(layer, _) = &request { Some(*layer) } else { None };
-        state.flights.insert(id, Flight { cancel: Arc::clone(&cancel), is_page, stream, useful: false });
+        let flight = Flight { cancel: Arc::clone(&cancel), is_page, stream, useful: false, is_out: false };
+        state.flights.insert(id, flight);
         Next::Fetch { id, cancel, request }
     }
 
-    async fn fetch(&self, request: &Request) -> Result<(), FetchError> {
+    async fn fetch(&self, id: u64, request: &Request) -> Result<(), FetchError> {
         let Scene { layers, .. } = &self.scene;
         match request {
             Request::Page(layer, number) => {
                 let layer_of = &layers[*layer];
                 let route = self.encoding.index_route(&self.scene, *layer, *number);
+                if let Some(blob) = self.kept(&route).await {
+                    if let Ok(entries) = decode_page(&layer_of.forest, *number, &blob) {
+                        self.deliver(Key::Page(*layer, *number), Event::Page(*layer, *number, entries));
+                        return Ok(());
+                    }
+                    self.forget(|| route.clone());
+                }
+                self.go_out(id, request)?;
                 let body = self.http.whole(&route, PAGE_BYTES_MAX).await?;
                 let entries = decode_page(&layer_of.forest, *number, &body)?;
+                self.keep(|| route, 0, &body.into());
                 self.deliver(Key::Page(*layer, *number), Event::Page(*layer, *number, entries));
                 Ok(())
             }
             Request::Batch(layer, wants) => {
+                let wants = self.deliver_kept(*layer, wants).await;
+                if wants.is_empty() {
+                    return Ok(());
+                }
+                self.go_out(id, request)?;
                 let centres: Vec<_> = wants.iter().map(|(d, _)| d.centre()).collect();
                 let route = self.encoding.batch_route(&self.scene, *layer, &centres);
                 let mut chunks = self.http.get(&route).await?;
@@ -242,7 +268,10 @@ impl Shared {
                     None => Err(FetchError::Early(shortened(&route))),
                 }
             }
-            Request::Stream(layer, ask) => self.stream(*layer, ask).await,
+            Request::Stream(layer, ask) => {
+                self.go_out(id, request)?;
+                self.stream(*layer, ask).await
+            }
         }
     }
 
@@ -256,6 +285,7 @@ impl Shared {
         payload: Bytes,
     ) -> Result<(), FetchError> {
         good_payload(d, bytes, header, &payload)?;
+        self.keep(|| self.route(Key::Diamond(layer, d)), d.level(), &payload);
         self.deliver(Key::Diamond(layer, d), Event::Payload(layer, d, payload));
         Ok(())
     }
@@ -312,7 +342,11 @@ impl Shared {
     /// Ends a request; `done` is `None` if it was dropped.
     fn land(&self, id: u64, done: Option<Result<(), FetchError>>) {
         let mut state = self.lock();
-        let useful = state.flights.remove(&id).is_some_and(|flight| flight.useful);
+        let flight = state.flights.remove(&id);
+        let useful = flight.as_ref().is_some_and(|flight| flight.useful);
+        if flight.is_some_and(|flight| flight.is_out) {
+            self.judge(&mut state, done.as_ref());
+        }
         let owed: Vec<Key> = state.flying.iter().filter(|(_, f)| **f == id).map(|(key, _)| *key).collect();
         for key in &owed {
             state.flying.remove(key);
@@ -320,6 +354,8 @@ impl Shared {
         match done {
             None => count(&self.http.traffic.cancelled, 1),
             Some(Ok(())) => {}
+            // Wherever it failed: until the server is back there is no use in trying.
+            Some(Err(_)) if state.away.is_some() => self.rest(&mut state, &owed),
             // Cut off, or garbled from some byte on, but not in vain: what it owes has not failed in itself.
             Some(Err(
                 FetchError::Early(_)
@@ -351,7 +387,7 @@ impl Shared {
         }
     }
 
-    fn stop(&self) {
+    pub(super) fn stop(&self) {
         let mut state = self.lock();
         if !state.stopped {
             state.stopped = true;
