@@ -2,7 +2,7 @@
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .NOTPARALLEL:
-.PHONY: help demo test test-long check contract objects bench bench-link bench-peers bench-serve bench-users bench-wasm setup fmt clippy tests doc deny wasm web web-test scripts
+.PHONY: help demo test test-long check contract objects bench bench-flight bench-link bench-peers bench-serve bench-users bench-wasm setup fmt clippy tests doc deny wasm web web-test scripts
 
 # Mesa's device selection complains where there is no desktop session; there is nothing to select.
 export NODEVICE_SELECT := 1
@@ -17,6 +17,7 @@ help:
 	@echo "make web-test  the viewer in a headless Chromium, on WebGPU and on WebGL2"
 	@echo "make check   formatting and lints only"
 	@echo "make bench   benchmarks, with a table at the end"
+	@echo "make bench-flight  memory over a flight of ten minutes, and a second session"
 	@echo "make bench-link    seconds to a view over slow links, on the DEMs of DIAMANTINA_DATA"
 	@echo "make bench-serve   requests a second beside nginx, where it and wrk are installed"
 	@echo "make bench-users   1000 users for five minutes, and 2000 idle connections"
@@ -37,6 +38,10 @@ bench:
 	@$(step) setup scripts/setup demo
 	@scripts/bench
 	@echo "Beside other codecs: make bench-peers (first run: an hour and more)"
+
+bench-flight:
+	@$(step) setup scripts/setup demo
+	@$(step) flight scripts/bench-flight
 
 bench-link:
 	@$(step) setup scripts/setup demo
@@ -104,4 +109,4 @@ web-test:
 	@$(step) web-test scripts/web-test
 
 scripts:
-	@$(step) scripts shellcheck .ci/run scripts/bench scripts/bench-link scripts/bench-peers scripts/bench-serve scripts/bench-users scripts/bench-wasm scripts/contract scripts/deny scripts/objects scripts/setup scripts/step scripts/wasm scripts/wasm-cargo scripts/web scripts/web-test
+	@$(step) scripts shellcheck .ci/run scripts/bench scripts/bench-flight scripts/bench-link scripts/bench-peers scripts/bench-serve scripts/bench-users scripts/bench-wasm scripts/contract scripts/deny scripts/objects scripts/setup scripts/step scripts/wasm scripts/wasm-cargo scripts/web scripts/web-test

@@ -27,6 +27,8 @@ mod heights;
 mod hostile;
 /// What the server answers to whom: routes, caches, refusals, heights.
 mod http;
+/// What was fetched, kept on the disk: the next session, two at once, no server, other versions, private scenes.
+mod keep;
 /// Law 7, at fifty moments: killed, a build leaves the scene before or a whole new one, for readers and for servers.
 mod killed;
 /// Several layers in one scene: built, resumed, served, drawn, refused.

@@ -151,6 +151,7 @@ fn each_layer_keeps_the_laws_of_errors_and_of_borders() {
                 sight: Sight::default(),
                 seen: None,
                 memory_bytes: usize::MAX,
+                gpu: None,
             };
             let ideal = cut::choose(&ask, |d| Some(entries[&d]));
             let missing: HashSet<Diamond> =

@@ -281,6 +281,7 @@ fn every_prefix_covers_the_forest_once_without_cracks() {
         sight: Sight::default(),
         seen: None,
         memory_bytes: usize::MAX,
+        gpu: None,
     };
     let ideal = cut::choose(&ask, |d| Some(entries[&d]));
     for question in questions(&layer) {

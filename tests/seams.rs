@@ -163,6 +163,7 @@ fn any_cut_of_a_built_store_with_anything_missing_has_no_cracks() {
                 sight: Sight { vertical: round % 2 == 0, foveation: if round % 3 == 0 { 4.0 } else { 1.0 } },
                 seen: None,
                 memory_bytes: if round % 7 == 6 { 40 * largest } else { usize::MAX },
+                gpu: None,
             };
             let ideal = cut::choose(&ask, |d| Some(entries[&d]));
             let arrived = if round % 5 == 0 { 1.0 } else { 0.6 + 0.4 * dice.roll() };

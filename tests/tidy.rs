@@ -56,6 +56,7 @@ const SERVER: &[(&str, &[&str])] = &[
 /// `cut` is a pure function of what it is given; the GPU is `render`'s and the fronts'.
 const CLIENT: &[(&str, &[&str])] = &[
     ("background", &[]),
+    ("disk", &[]),
     ("camera", &[]),
     ("encoding", &[]),
     ("surface", &["encoding"]),
@@ -63,7 +64,7 @@ const CLIENT: &[(&str, &[&str])] = &[
     ("morph", &["surface"]),
     ("drawing", &["morph", "surface"]),
     ("cache", &["surface"]),
-    ("fetch", &["background", "encoding"]),
+    ("fetch", &["background", "disk", "encoding"]),
     ("doctor", &["encoding", "fetch", "surface"]),
     ("load", &["cache", "camera", "cut", "encoding", "fetch", "headless", "overview", "sight", "surface"]),
     ("sight", &["camera"]),

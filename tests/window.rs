@@ -121,7 +121,11 @@ fn steady(screen: &Screen, what: &str) -> (usize, Vec<[u8; 3]>) {
 fn view(screen: &Screen, folder: &Path, url: &str) -> Running {
     let mut command = Command::new(&programs().client);
     command.args(["view", url, "--size", "1000x700", "--error-pixels", "4", "--no-antialias"]);
-    command.env("DISPLAY", &screen.name).env_remove("WAYLAND_DISPLAY").current_dir(folder);
+    command
+        .env("DISPLAY", &screen.name)
+        .env("XDG_CACHE_HOME", folder.join("cache"))
+        .env_remove("WAYLAND_DISPLAY")
+        .current_dir(folder);
     Running(command.stdout(Stdio::null()).stderr(Stdio::inherit()).spawn().unwrap())
 }
 

@@ -64,6 +64,7 @@ fn main() {
         sight: Sight::default(),
         seen: None,
         memory_bytes,
+        gpu: None,
     };
     let root = layer.forest.root_diamonds().next().expect("a forest has roots");
     let surface =

@@ -258,6 +258,7 @@ mod tests {
                 sight: Sight::default(),
                 seen: None,
                 memory_bytes: 225 * size,
+                gpu: None,
             };
             let ideal = choose(&ask, |d| Some(built.entries[&d]));
             cache.want(ideal.splits().map(|d| (0, d)));

@@ -1,24 +1,29 @@
 //! The command line of the client.
 
 mod annotate;
+mod keep;
 mod load;
 mod look;
+mod size;
 
 use annotate::AnnotateArgs;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use diamantina_client::camera::{Camera, FOV_Y};
+use diamantina_client::disk::Disk;
 use diamantina_client::doctor::{self, Verdict};
 use diamantina_client::encoding::Encoding;
 use diamantina_client::fetch::{self, FetchError};
 use diamantina_client::headless::{self, Flight, FlightPath, FrameLine, PictureReport};
 use diamantina_client::morph;
-use diamantina_client::render::Look;
+use diamantina_client::render::{self, Look};
 use diamantina_client::sight::Sight;
 use diamantina_client::terrain::{self, Imagery, Terrain, TerrainError};
 use diamantina_client::texture::FADE_SECONDS;
 use diamantina_client::viewer::{self, Viewer};
 use glam::DVec3;
+use keep::{KeepArgs, Kept, tell_offline};
 use look::{LookArgs, untrue};
+use size::parse_size as parse_bytes;
 use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -75,6 +80,9 @@ struct ViewerArgs {
     /// Seconds that points take to move where the level of detail changes [default: 0.3, and 0 for tin and with --true]
     #[arg(long, value_name = "SECONDS")]
     morph: Option<f64>,
+    /// Keep nothing on the disk
+    #[arg(long, conflicts_with_all = ["disk_cache", "offline"])]
+    no_disk_cache: bool,
 }
 
 #[derive(Args, Clone)]
@@ -114,9 +122,15 @@ struct ViewArgs {
     /// Memory for tiles of imagery, and as much again on the GPU
     #[arg(long, default_value = "128", value_name = "MIB", value_parser = clap::value_parser!(u16).range(4..=1000))]
     texture_memory: u16,
-    /// Memory for decoded diamonds
-    #[arg(long, default_value = "1024", value_name = "MIB")]
-    memory: usize,
+    /// Memory for decoded diamonds; where it is too little for the error asked for, the view is coarser
+    #[arg(long, default_value = "1GiB", value_name = "SIZE", value_parser = parse_bytes)]
+    memory: u64,
+    /// GPU memory for the diamonds that are drawn and their motions; where it is too little, the view is coarser. The
+    /// pictures that a frame is made of come on top: some 36 bytes a pixel, 8 with --no-antialias, and with water 16 more
+    #[arg(long, default_value = "512MiB", value_name = "SIZE", value_parser = parse_bytes)]
+    gpu_memory: u64,
+    #[command(flatten)]
+    keep: KeepArgs,
     #[command(flatten)]
     look: LookArgs,
     #[command(flatten)]
@@ -162,6 +176,12 @@ struct FlyArgs {
     /// The path, as {"keys": [{"seconds": 0, "eye": [x,y,z], "target": [x,y,z]}, ...]} [default: a round over the scene]
     #[arg(long, value_name = "JSON")]
     path: Option<PathBuf>,
+    /// Fly at random for --seconds, the same way for the same number
+    #[arg(long, value_name = "SEED", conflicts_with = "path")]
+    random: Option<u64>,
+    /// How long a flight at random is, in the path's time
+    #[arg(long, default_value_t = 60.0, value_name = "SECONDS", requires = "random")]
+    seconds: f64,
     /// Frames to draw, spread evenly over the path
     #[arg(long, default_value_t = 300, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     frames: u32,
@@ -254,7 +274,11 @@ impl ViewArgs {
         Look { annotations: self.annotate.annotations(), ..self.look.look(terrain.scene()) }
     }
 
-    fn open(&self, morph_seconds: f64) -> Result<Terrain, Failure> {
+    fn render_options(&self) -> render::Options {
+        render::Options { budget_bytes: self.gpu_memory, ..self.look.options() }
+    }
+
+    fn open(&self, morph_seconds: f64, disk: Option<&Disk>) -> Result<Terrain, Failure> {
         if !(self.error_pixels.is_finite() && self.error_pixels > 0.0) {
             return Err(Failure(
                 2,
@@ -275,12 +299,15 @@ impl ViewArgs {
         };
         let options = terrain::Options {
             tolerance_pixels: self.error_pixels,
-            memory_bytes: self.memory << 20,
+            memory_bytes: usize::try_from(self.memory).unwrap_or(usize::MAX),
+            gpu_bytes: self.gpu_memory,
             sight: Sight { vertical: !self.sphere_error, foveation: self.foveation },
             morph_seconds,
             fetch: fetch::Options {
                 encoding,
                 token: self.token.token.as_deref().map(Into::into),
+                disk: disk.cloned(),
+                offline: self.keep.is_offline(),
                 ..fetch::Options::default()
             },
             layers: self.layers.clone(),
@@ -294,7 +321,7 @@ impl ViewArgs {
             fade_seconds: if morph_seconds > 0.0 { FADE_SECONDS.min(morph_seconds) } else { 0.0 },
             ..terrain::Options::default()
         };
-        Terrain::open(&self.url, options).map_err(|error| {
+        let terrain = Terrain::open(&self.url, options).map_err(|error| {
             let wrong_use = matches!(
                 error,
                 TerrainError::Fetch(FetchError::Address { .. } | FetchError::Layer { .. })
@@ -303,7 +330,9 @@ impl ViewArgs {
                     | TerrainError::Still
             );
             Failure(if wrong_use { 2 } else { 1 }, error.to_string())
-        })
+        })?;
+        tell_offline(&terrain);
+        Ok(terrain)
     }
 }
 
@@ -313,7 +342,8 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
     if args.stream && matches!(args.view.encoding, EncodingName::Tin) {
         return Err(Failure(2, "streams are of points: leave --stream or --encoding tin out".to_owned()));
     }
-    let mut terrain = args.view.open(0.0)?;
+    let kept = args.view.keep.open(false)?;
+    let mut terrain = args.view.open(0.0, kept.0.as_ref())?;
     let ViewArgs { size, .. } = args.view;
     let exaggeration = args.view.look.exaggeration;
     let camera = match (args.eye, args.target) {
@@ -340,7 +370,7 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
     };
     let look = args.view.look(&terrain);
     let (picture, report) =
-        headless::picture(&mut terrain, &camera, &look, &args.view.look.options(), patience)?;
+        headless::picture(&mut terrain, &camera, &look, &args.view.render_options(), patience)?;
     headless::save(&picture, &args.output)?;
     if let Some(path) = &args.json {
         let mut out = headless::open_text(path)?;
@@ -350,10 +380,14 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
     if args.json.as_ref().is_none_or(|p| p.as_os_str() != "-") {
         shown(print_report(args, &report))?;
     }
-    if report.complete {
-        return Ok(());
-    }
-    let why = terrain.problem().unwrap_or("the data did not arrive in time; wait longer with --timeout");
+    let why = match (report.complete, report.limited_by_memory) {
+        (true, false) => return Ok(()),
+        (true, true) => "there is no memory for less: raise --memory or --gpu-memory",
+        (false, _) if report.offline => "offline, and more was not fetched before",
+        (false, _) => {
+            terrain.problem().unwrap_or("the data did not arrive in time; wait longer with --timeout")
+        }
+    };
     Err(Failure(
         1,
         format!(
@@ -379,6 +413,9 @@ fn print_report(args: &RenderArgs, r: &PictureReport) -> std::io::Result<()> {
         "  {} bytes in {} requests and {} round trips; {} real points, {} fictitious",
         r.bytes, r.requests, r.round_trips, r.real_points, r.fictitious_points
     )?;
+    if r.disk_bytes > 0 {
+        writeln!(out, "  {} bytes fetched before{}", r.disk_bytes, if r.offline { ", offline" } else { "" })?;
+    }
     writeln!(
         out,
         "  {} triangles in {} draws, {:.0} ms a frame",
@@ -404,11 +441,12 @@ fn view(args: &ViewerArgs) -> Result<(), Failure> {
         None => (args.view.url.clone(), None),
     };
     let view = ViewArgs { url: url.clone(), ..args.view.clone() };
-    let terrain = view.open(morph)?;
+    let kept = if args.no_disk_cache { Kept(None) } else { view.keep.open(true)? };
+    let terrain = view.open(morph, kept.0.as_ref())?;
     let look = view.look(&terrain);
     let title = format!("{} - Diamantina", terrain.scene().name);
     let viewer = Viewer::new(terrain, &url, look, view.size, at);
-    viewer::window::run(viewer, &title, &view.look.options()).map_err(|e| Failure(1, e.to_string()))
+    viewer::window::run(viewer, &title, &view.render_options()).map_err(|e| Failure(1, e.to_string()))
 }
 
 fn doctor(args: &DoctorArgs) -> Result<(), Failure> {
@@ -462,8 +500,17 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
         return Err(Failure(2, format!("--morph {}: expected seconds from 0 to {max}", args.morph)));
     }
     let path = args.path.as_deref().map(FlightPath::read).transpose()?;
-    let mut terrain = args.view.open(args.morph)?;
-    let path = path.unwrap_or_else(|| FlightPath::round(&terrain.shown_scene()));
+    if !(args.seconds > 0.0 && args.seconds <= headless::RANDOM_SECONDS_MAX) {
+        let (found, most) = (args.seconds, headless::RANDOM_SECONDS_MAX);
+        return Err(Failure(2, format!("--seconds {found}: expected seconds above 0, at most {most}")));
+    }
+    let kept = args.view.keep.open(false)?;
+    let mut terrain = args.view.open(args.morph, kept.0.as_ref())?;
+    let path = path.unwrap_or_else(|| {
+        let scene = terrain.shown_scene();
+        args.random
+            .map_or_else(|| FlightPath::round(&scene), |seed| FlightPath::random(&scene, seed, args.seconds))
+    });
     let mut csv = args.csv.as_deref().map(headless::open_text).transpose()?;
     if let Some(out) = &mut csv {
         writeln!(out, "{}", FrameLine::HEADING)?;
@@ -491,7 +538,7 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
     let mut failed = None;
     let bar = indicatif::ProgressBar::new(args.frames.into());
     let look = args.view.look(&terrain);
-    headless::fly(&mut terrain, &path, &flight, &look, &args.view.look.options(), |line, _| {
+    headless::fly(&mut terrain, &path, &flight, &look, &args.view.render_options(), |line, _| {
         slowest_cut = slowest_cut.max(line.cut_ms);
         draw_sum += line.draw_ms;
         bar.inc(1);

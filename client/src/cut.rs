@@ -55,6 +55,23 @@ pub struct Ask<'a> {
     pub seen: Option<Seen<'a>>,
     /// Bytes that the surfaces of split diamonds may take; the roots are split in any case.
     pub memory_bytes: usize,
+    /// What the surfaces that are drawn may take on the GPU; nothing: whatever they take.
+    pub gpu: Option<Gpu<'a>>,
+}
+
+/// What a cut may take on the GPU.
+#[derive(Clone, Copy)]
+pub struct Gpu<'a> {
+    /// Bytes that the surfaces that are drawn may take together. The roots are drawn in any case.
+    pub bytes: u64,
+    /// What the surface of a diamond takes, if it is resident: others take what is usual, until they are.
+    pub of: &'a dyn Fn(Diamond) -> Option<u64>,
+}
+
+impl std::fmt::Debug for Gpu<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Gpu").field("bytes", &self.bytes).finish_non_exhaustive()
+    }
 }
 
 /// What is seen of a layer's diamonds from the zone that the eye is in.
@@ -70,6 +87,17 @@ impl Ask<'_> {
     /// Bytes of memory that the surface of a diamond is expected to take.
     fn surface_bytes(&self, level: u32, entry: &Entry) -> usize {
         Surface::expected_bytes(self.encoding, &self.layer.forest, level, entry.bytes)
+    }
+
+    /// Bytes of GPU memory that the surface of a diamond takes, or is expected to.
+    fn gpu_bytes(&self, d: Diamond, entry: &Entry) -> u64 {
+        let Some(gpu) = &self.gpu else { return 0 };
+        let usual = || Surface::expected_gpu_bytes(self.encoding, &self.layer.forest, d.level(), entry.bytes);
+        (gpu.of)(d).unwrap_or_else(usual)
+    }
+
+    fn gpu_limit(&self) -> u64 {
+        self.gpu.map_or(u64::MAX, |gpu| gpu.bytes)
     }
 
     /// The box of a diamond as it is drawn.
@@ -107,6 +135,7 @@ pub struct Ideal {
     pages: Vec<u32>,
     /// For each of the splits, the error in pixels of the triangles that no child has; 0 above the finest level.
     finest_pixels: Vec<f64>,
+    is_limited: bool,
 }
 
 /// A diamond that was looked at.
@@ -124,6 +153,40 @@ struct Node {
     split: bool,
     parents: [u32; 2],
     children: [u32; 4],
+    /// What its surface takes on the GPU, once it is split.
+    gpu_bytes: u64,
+}
+
+/// What the drawn surfaces take on the GPU, as one diamond after the other is split.
+#[derive(Debug, Default)]
+struct Drawn {
+    /// How many triangles each of the split nodes shows.
+    shows: HashMap<u32, u8, RandomState>,
+    bytes: u64,
+}
+
+impl Drawn {
+    /// Splits a node whose parents are split: it is drawn as long as it shows something, and so are they.
+    fn split(&mut self, nodes: &[Node], number: u32, is_finest: bool) {
+        let node = &nodes[number as usize];
+        let is_seen = |node: &Node| node.in_view && !node.entry.is_empty();
+        let open = |child: &&u32| **child != NONE && is_seen(&nodes[**child as usize]);
+        let triangles = node.children.iter().filter(open).count();
+        let shows = triangles + usize::from(is_finest && node.in_view);
+        if shows > 0 {
+            self.shows.insert(number, u8::try_from(shows).unwrap_or(u8::MAX));
+            self.bytes += node.gpu_bytes;
+        }
+        for parent in node.parents.into_iter().filter(|parent| *parent != NONE && is_seen(node)) {
+            if let Some(shows) = self.shows.get_mut(&parent) {
+                *shows -= 1;
+                if *shows == 0 {
+                    self.shows.remove(&parent);
+                    self.bytes -= nodes[parent as usize].gpu_bytes;
+                }
+            }
+        }
+    }
 }
 
 /// A payload that the ideal set lacks.
@@ -193,6 +256,12 @@ impl Ideal {
         self.nodes.iter().map(|node| node.diamond)
     }
 
+    /// Whether more would be split, had it the memory.
+    #[must_use]
+    pub fn is_limited(&self) -> bool {
+        self.is_limited
+    }
+
     /// Pages of the index without which it is not known what to split, most urgent first.
     #[must_use]
     pub fn pages(&self) -> &[u32] {
@@ -218,6 +287,7 @@ pub fn choose(ask: &Ask, entry: impl Fn(Diamond) -> Option<Entry>) -> Ideal {
         heap: BinaryHeap::new(),
         wanted: HashSet::default(),
         spent_bytes: 0,
+        drawn: Drawn::default(),
     };
     let roots: Vec<u32> = chooser.forest.root_diamonds().map(|root| chooser.see(root, None)).collect();
     for root in roots {
@@ -260,15 +330,24 @@ pub fn draw(
     // Surfaces of the nodes that are drawn as split.
     let mut drawn: Vec<Option<Arc<Surface>>> = vec![None; ideal.nodes.len()];
     let mut whole = true;
+    let mut gpu = Drawn::default();
     for i in &ideal.splits {
         let node = ideal.node(*i);
-        let here = surface(node.diamond);
+        let mut here = surface(node.diamond);
         if here.is_none() {
             let bytes = node.known.then_some(node.entry.bytes);
             drawing.wishes.push(Wish { diamond: node.diamond, bytes, priority: node.priority });
             whole &= node.diamond.level() > 0;
         }
         if node.parents.iter().all(|p| *p == NONE || drawn[*p as usize].is_some()) {
+            if ask.gpu.is_some() && here.is_some() {
+                // What is still to come may leave a parent drawn beside its children.
+                if node.diamond.level() > 0 && gpu.bytes + node.gpu_bytes > ask.gpu_limit() {
+                    here = None;
+                } else {
+                    gpu.split(&ideal.nodes, *i, node.diamond.level() + 1 == ask.layer.forest.levels());
+                }
+            }
             drawing.splits.extend(here.as_ref().map(|_| node.diamond));
             drawn[*i as usize] = here;
         }
@@ -366,8 +445,10 @@ struct Chooser<'a, F> {
     ideal: Ideal,
     heap: BinaryHeap<Candidate>,
     wanted: HashSet<u32, RandomState>,
-    /// What the surfaces of the split diamonds take.
+    /// What the surfaces of the split diamonds take ...
     spent_bytes: usize,
+    /// ... and on the GPU those that are drawn.
+    drawn: Drawn,
 }
 
 impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
@@ -397,6 +478,7 @@ impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
             split: false,
             parents: [NONE; 2],
             children: [NONE; 4],
+            gpu_bytes: 0,
         });
         if pixels > self.ask.tolerance_pixels {
             self.heap.push(Candidate { pixels, level: d.level(), number });
@@ -430,8 +512,12 @@ impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
         let finest =
             is_finest.then(|| self.ask.pixels(diamond, level, error, &self.ask.bounds(diamond, &entry)));
         self.ideal.finest_pixels.push(finest.unwrap_or(0.0));
+        let gpu_bytes = self.ask.gpu_bytes(diamond, &entry);
         let node = &mut self.ideal.nodes[number as usize];
-        (node.split, node.parents, node.children) = (true, parents, children);
+        (node.split, node.parents, node.children, node.gpu_bytes) = (true, parents, children, gpu_bytes);
+        if self.ask.gpu.is_some() {
+            self.drawn.split(&self.ideal.nodes, number, diamond.level() + 1 == level);
+        }
         self.ideal.splits.push(number);
     }
 
@@ -439,6 +525,7 @@ impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
     /// know them all or the memory is spent.
     fn force(&mut self, number: u32) {
         if self.spent_bytes >= self.ask.memory_bytes {
+            self.ideal.is_limited = true;
             return;
         }
         let mut chain = vec![number];
@@ -464,7 +551,15 @@ impl<F: Fn(Diamond) -> Option<Entry>> Chooser<'_, F> {
         let level = |i: &u32| self.ideal.node(*i).diamond.level();
         let bytes = |i: &u32| self.ask.surface_bytes(level(i), &self.ideal.node(*i).entry);
         let bytes: usize = chain.iter().map(bytes).sum();
-        if blocked || self.spent_bytes + bytes > self.ask.memory_bytes {
+        let gpu = |i: &u32| {
+            let node = self.ideal.node(*i);
+            self.ask.gpu_bytes(node.diamond, &node.entry)
+        };
+        let gpu_bytes: u64 = chain.iter().map(gpu).sum();
+        let is_too_much = self.spent_bytes + bytes > self.ask.memory_bytes
+            || self.drawn.bytes.saturating_add(gpu_bytes) > self.ask.gpu_limit();
+        if blocked || is_too_much {
+            self.ideal.is_limited |= !blocked;
             return;
         }
         chain.sort_by_key(|i| self.ideal.node(*i).diamond.level());

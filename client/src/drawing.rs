@@ -21,6 +21,15 @@ pub struct DrawItem {
     pub moving: Option<Moving>,
 }
 
+impl DrawItem {
+    /// Bytes of GPU memory that it takes at most; with `wires` also the lines around its triangles.
+    #[must_use]
+    pub fn gpu_bytes(&self, wires: bool) -> u64 {
+        let motion = self.moving.as_ref().map_or(0, |moving| size_of_val(moving.motion.records()) as u64);
+        self.surface.gpu_bytes(wires) + motion
+    }
+}
+
 /// A motion at a moment.
 #[derive(Debug, Clone)]
 pub struct Moving {

@@ -59,6 +59,15 @@ impl Encoding {
         route(&scene.name, &scene.version, &scene.layers[layer].name, page)
     }
 
+    /// The path of one of a layer's diamonds.
+    pub(crate) fn route(self, scene: &Scene, layer: usize, centre: Point) -> String {
+        let route = match self {
+            Self::Points => message::points_route,
+            Self::Tin => message::tin_route,
+        };
+        route(&scene.name, &scene.version, &scene.layers[layer].name, centre)
+    }
+
     /// The path and query of a batch of a layer's diamonds.
     pub(crate) fn batch_route(self, scene: &Scene, layer: usize, centres: &[Point]) -> String {
         let route = match self {

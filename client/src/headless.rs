@@ -13,7 +13,7 @@ use crate::terrain::{FrameView, Stats, Terrain, TerrainError};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::message::{Layer, Scene};
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -22,6 +22,12 @@ use std::time::{Duration, Instant};
 
 /// Most key frames of a path.
 const KEYS_MAX: usize = 100_000;
+
+/// The longest flight at random, in seconds: a day.
+pub const RANDOM_SECONDS_MAX: f64 = 86_400.0;
+
+/// Seconds between its keys.
+const RANDOM_STEP: f64 = 5.0;
 
 /// The largest file with a path, in bytes.
 const PATH_BYTES_MAX: u64 = 64 << 20;
@@ -180,6 +186,21 @@ pub struct PictureReport {
     pub texture_tiles: usize,
     /// Whether all that was wanted arrived.
     pub complete: bool,
+    /// Whether the largest error is within the asked one. Where all has arrived and it is not, the scene has no more, or
+    /// the memory holds no more.
+    pub asked_error_reached: bool,
+    /// Whether memory, here or on the GPU, kept it from the asked error.
+    pub limited_by_memory: bool,
+    /// Whether the server was not asked: what is drawn was fetched before.
+    pub offline: bool,
+    /// Bytes of payloads and pages that were fetched before, and came from the disk.
+    pub disk_bytes: u64,
+    /// Bytes of memory that resident diamonds take.
+    pub resident_bytes: usize,
+    /// Bytes of GPU memory that the drawn diamonds take.
+    pub gpu_bytes: u64,
+    /// Bytes of GPU memory that the picture itself takes, and what all diamonds share: see [`FrameStats::fixed_bytes`].
+    pub gpu_fixed_bytes: u64,
     /// Milliseconds to draw the finished picture.
     pub milliseconds_a_frame: f64,
 }
@@ -199,6 +220,7 @@ pub fn picture(
     let mut offscreen = Offscreen::new(options)?;
     let drawn = stretched(camera, look.exaggeration);
     terrain.set_exaggeration(look.exaggeration);
+    terrain.set_wires(look.wireframe);
     let view = terrain.settle(&drawn, patience);
     let layers = &terrain.scene().layers;
     offscreen.drape(view.drape.as_ref());
@@ -282,6 +304,13 @@ fn report(
         texture: terrain.texture().map(|number| terrain.scene().textures[number].name.clone()),
         texture_tiles: view.stats.texture_tiles,
         complete: view.complete,
+        asked_error_reached: view.error_pixels <= terrain.tolerance_pixels(),
+        limited_by_memory: view.limited,
+        offline: view.stats.offline,
+        disk_bytes: traffic.disk_bytes,
+        resident_bytes: view.stats.resident_bytes,
+        gpu_bytes: frame.gpu_bytes,
+        gpu_fixed_bytes: frame.fixed_bytes,
         milliseconds_a_frame,
     }
 }
@@ -382,6 +411,38 @@ impl FlightPath {
         Self { keys: keys.collect() }
     }
 
+    /// A flight at random, the same for the same seed: from place to place, low over the ground and high above it, with a key
+    /// every five seconds. At most [`RANDOM_SECONDS_MAX`].
+    #[must_use]
+    pub fn random(scene: &Scene, seed: u64, seconds: f64) -> Self {
+        let [low, high] = extent(scene);
+        let span = (high - low).truncate();
+        let mut dice = Dice(seed);
+        let seconds = seconds.clamp(1e-3, RANDOM_SECONDS_MAX);
+        let count = (seconds / RANDOM_STEP).ceil().max(1.0);
+        let mut place = low.truncate() + span * DVec2::new(dice.roll(), dice.roll());
+        #[allow(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "at most some ten thousand"
+        )]
+        let keys = (0..=count as u32).map(|i| {
+            // Mostly on to somewhere near, now and then far away.
+            let reach = if dice.roll() < 0.15 { 0.6 } else { 0.08 };
+            let step = span * reach * (DVec2::new(dice.roll(), dice.roll()) - 0.5);
+            place = (place + step).clamp(low.truncate(), high.truncate());
+            // From a two-hundredth to a third of the scene's size above its highest ground.
+            let above = span.max_element() * 0.005 * 66f64.powf(dice.roll());
+            let ahead =
+                DVec2::from_angle(std::f64::consts::TAU * dice.roll()) * above * (1.0 + 3.0 * dice.roll());
+            let (eye, target) =
+                (place.extend(high.z + above), (place + ahead).extend(low.z.midpoint(high.z)));
+            let at = f64::from(i) / count * seconds;
+            PathKey { seconds: at, eye: eye.to_array(), target: target.to_array() }
+        });
+        Self { keys: keys.collect() }
+    }
+
     /// Seconds from the first key to the last.
     #[must_use]
     pub fn seconds(&self) -> f64 {
@@ -412,6 +473,20 @@ impl FlightPath {
                 + (3.0 * b - a - 3.0 * c + d) * t3)
         };
         Camera { eye: curve(|k| k.eye), target: curve(|k| k.target), fov_y: FOV_Y, size }
+    }
+}
+
+/// Numbers that look random, the same from the same beginning (splitmix64).
+pub(crate) struct Dice(pub(crate) u64);
+
+impl Dice {
+    /// From 0 to below 1.
+    pub(crate) fn roll(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut v = self.0;
+        v = (v ^ v >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        v = (v ^ v >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
+        ((v ^ v >> 31) >> 11) as f64 / (1u64 << 53) as f64
     }
 }
 
@@ -478,17 +553,25 @@ pub struct FrameLine {
     pub fictitious_points: u64,
     /// Whether the eye was in the zone that was asked for: see [`PictureReport::zone_in_effect`].
     pub zone_in_effect: bool,
+    /// Bytes of GPU memory besides those of surfaces: see [`FrameStats::fixed_bytes`].
+    pub gpu_fixed_bytes: u64,
+    /// Bytes so far that were fetched before, and came from the disk.
+    pub disk_bytes: u64,
+    /// Whether the server was not asked.
+    pub offline: bool,
+    /// Whether memory, here or on the GPU, kept the ideal cut from the asked error.
+    pub limited_by_memory: bool,
 }
 
 impl FrameLine {
     /// The heading of the CSV.
-    pub const HEADING: &str = "frame,seconds,cut_ms,draw_ms,error_pixels,goal_pixels,complete,moving,diamonds,triangles,draws,uploaded_bytes,gpu_bytes,resident,resident_bytes,bytes,requests,round_trips,real_points,fictitious_points,zone_in_effect";
+    pub const HEADING: &str = "frame,seconds,cut_ms,draw_ms,error_pixels,goal_pixels,complete,moving,diamonds,triangles,draws,uploaded_bytes,gpu_bytes,resident,resident_bytes,bytes,requests,round_trips,real_points,fictitious_points,zone_in_effect,gpu_fixed_bytes,disk_bytes,offline,limited_by_memory";
 
     /// The line, with the fields of the heading.
     #[must_use]
     pub fn csv(&self) -> String {
         format!(
-            "{},{:.4},{:.3},{:.3},{:.4},{:.4},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+            "{},{:.4},{:.3},{:.3},{:.4},{:.4},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
             self.frame,
             self.seconds,
             self.cut_ms,
@@ -510,6 +593,10 @@ impl FrameLine {
             self.real_points,
             self.fictitious_points,
             self.zone_in_effect,
+            self.gpu_fixed_bytes,
+            self.disk_bytes,
+            self.offline,
+            self.limited_by_memory,
         )
     }
 }
@@ -532,6 +619,7 @@ pub fn fly(
     terrain.set_exaggeration(look.exaggeration);
     // Of a version of the scene.
     let mut annotator: Option<(String, Annotator)> = None;
+    terrain.set_wires(look.wireframe);
     let started = Instant::now();
     for frame in 0..flight.frames {
         if flight.frames_a_second > 0.0 {
@@ -592,6 +680,10 @@ pub fn fly(
             real_points: view.stats.points_real,
             fictitious_points: view.stats.points_fictitious,
             zone_in_effect: view.stats.zone_in_effect,
+            gpu_fixed_bytes: stats.fixed_bytes,
+            disk_bytes: view.stats.traffic.disk_bytes,
+            offline: view.stats.offline,
+            limited_by_memory: view.limited,
         };
         if let (Some(folder), Some(picture)) = (&flight.pictures, &picture) {
             save(picture, &folder.join(format!("frame-{frame:05}.png")))?;
@@ -691,6 +783,10 @@ mod tests {
             real_points: 11,
             fictitious_points: 12,
             zone_in_effect: true,
+            gpu_fixed_bytes: 13,
+            disk_bytes: 14,
+            offline: false,
+            limited_by_memory: true,
         };
         assert_eq!(line.csv().split(',').count(), FrameLine::HEADING.split(',').count());
         let json = serde_json::to_value(&line).unwrap();

@@ -6,6 +6,7 @@
 //! | [`sight`] | how large an error looks: metres and a box → pixels |
 //! | [`cut`] | camera and resident diamonds → what to draw and what to ask for |
 //! | [`background`] | work beside the frames: on threads, or between frames in a browser |
+//! | [`disk`] | what was fetched, kept for the next session; not in a browser |
 //! | [`fetch`] | requests by priority, retried, cancellable; answers as they stream in |
 //! | [`cache`] | decoded diamonds under a byte budget |
 //! | [`encoding`] | points or irregular triangles: which of them is streamed |
@@ -32,6 +33,11 @@ pub mod cache;
 pub mod camera;
 pub mod controls;
 pub mod cut;
+#[cfg(not(target_arch = "wasm32"))]
+pub mod disk;
+#[cfg(target_arch = "wasm32")]
+#[path = "disk/none.rs"]
+pub mod disk;
 #[cfg(not(target_arch = "wasm32"))]
 pub mod doctor;
 pub mod drawing;

@@ -229,6 +229,7 @@ impl Cut {
 #[derive(Debug, Default)]
 pub struct Morphs {
     duration: i32,
+    motions_max: usize,
     /// What the last frame drew as split.
     last: HashSet<Diamond, RandomState>,
     /// Those of diamonds with a point that moves.
@@ -241,13 +242,25 @@ impl Morphs {
     /// Motions that take `seconds`, at most [`SECONDS_MAX`]; with 0 there are none.
     #[must_use]
     pub fn new(seconds: f64) -> Self {
-        Self { duration: (seconds.min(SECONDS_MAX) * TICKS_A_SECOND) as i32, ..Self::default() }
+        let duration = (seconds.min(SECONDS_MAX) * TICKS_A_SECOND) as i32;
+        Self { duration, motions_max: MOTIONS_MAX, ..Self::default() }
+    }
+
+    /// Has no more than so many diamonds move at a time, at most [`MOTIONS_MAX`].
+    pub fn set_motions_max(&mut self, motions_max: usize) {
+        self.motions_max = motions_max.min(MOTIONS_MAX);
     }
 
     /// Whether anything ever moves.
     #[must_use]
     pub fn is_on(&self) -> bool {
         self.duration > 0
+    }
+
+    /// Goes to a cut at once: nothing moves any more.
+    pub fn jump(&mut self, wanted: &[Diamond]) {
+        self.motions.clear();
+        self.last = wanted.iter().copied().collect();
     }
 
     /// Goes on to the next frame: what it draws as split. Costs up to half a millisecond for each motion that begins.
@@ -349,7 +362,7 @@ impl Morphs {
     }
 
     fn start(&mut self, change: &Change, d: Diamond, way: Way, starts: &mut usize) -> bool {
-        let is_full = self.motions.len() >= MOTIONS_MAX && !self.motions.contains_key(&d);
+        let is_full = self.motions.len() >= self.motions_max && !self.motions.contains_key(&d);
         if *starts >= STARTS_MAX || is_full {
             return false;
         }

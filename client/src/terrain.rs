@@ -17,11 +17,12 @@
 mod decoders;
 mod imagery;
 mod reload;
+mod shares;
 mod shown;
 
-use crate::cache::{Cache, Index, Key, PAGES_MAX};
+use crate::cache::{Cache, Index, Key};
 use crate::camera::{Camera, Plane};
-use crate::cut::{self, Ask, Drawing, Ideal, Seen, Wish};
+use crate::cut::{self, Ask, Drawing, Gpu, Ideal, Seen, Wish};
 use crate::drawing::DrawItem;
 use crate::encoding::Encoding;
 use crate::fetch::{self, Event, FetchError, Fetcher, ROOT_BYTES, Traffic, Want};
@@ -38,14 +39,12 @@ use foldhash::fast::RandomState;
 use glam::DVec3;
 pub use imagery::Imagery;
 use reload::Reload;
+use shares::Shares;
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 #[cfg(not(target_arch = "wasm32"))]
 use std::time::Duration;
 use web_time::Instant;
-
-/// Bytes of payloads that are wished for or wait for their parents. Some 20 000 typical payloads.
-const HELD_BYTES_MAX: usize = 16 << 20;
 
 /// Wishes that are made however much is held: payloads may be waiting for these.
 const WISHES_MIN: usize = 64;
@@ -57,9 +56,6 @@ const EVENTS_MIN: usize = 64;
 /// away, or there is no memory for more.
 const STRAYS_MAX: usize = 256;
 
-/// Decoded surfaces that wait for a frame to take them: 25 MB for n = 64. The decoders pause there.
-const DONE_MAX: usize = 256;
-
 /// How to stream a scene.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
@@ -69,9 +65,12 @@ pub struct Options {
     pub exaggeration: f64,
     /// How errors count on the screen.
     pub sight: Sight,
-    /// Memory for surfaces, in bytes. What the cut wants takes at most three quarters of it: where that is
-    /// too little for the tolerance, the largest errors are reduced first.
+    /// Memory for surfaces and what is on its way to become one, in bytes. What the cut wants takes at most three quarters
+    /// of it: where that is too little for the tolerance, the largest errors are reduced first.
     pub memory_bytes: usize,
+    /// GPU memory for the surfaces that are drawn and for their motions, in bytes. Where it is too little for the tolerance, the
+    /// largest errors are reduced first; where it is too little for motions, points jump.
+    pub gpu_bytes: u64,
     /// Seconds that points take to move from one cut to the next, at most [`morph::SECONDS_MAX`]; 0: they jump.
     pub morph_seconds: f64,
     /// The names of the layers to stream and draw; none: all.
@@ -95,6 +94,7 @@ impl Default for Options {
             exaggeration: 1.0,
             sight: Sight::default(),
             memory_bytes: 512 << 20,
+            gpu_bytes: 512 << 20,
             morph_seconds: 0.0,
             layers: None,
             zone: None,
@@ -207,6 +207,8 @@ pub struct Stats {
     pub splits_drawn: usize,
     /// Things that have failed too often and rest before they are tried again.
     pub failed: usize,
+    /// Whether the server is not asked, since it cannot be reached or nobody wants it to be: what is drawn was fetched before.
+    pub offline: bool,
     /// Whether the last frame's eye was in the zone that was asked for.
     pub zone_in_effect: bool,
     /// Seconds from opening to the first frame that drew something.
@@ -234,6 +236,8 @@ pub struct FrameView {
     pub error_pixels_goal: f64,
     /// Whether all that the ideal cut wants is there.
     pub complete: bool,
+    /// Whether memory, here or on the GPU, keeps the ideal cut from the tolerance.
+    pub limited: bool,
     /// Diamonds in motion, or about to be, and tiles of imagery: the next frame looks different, even if nothing arrives. The error counts
     /// them as not yet split.
     pub moving: usize,
@@ -243,8 +247,8 @@ pub struct FrameView {
 
 /// A scene that is being streamed.
 ///
-/// Takes [`Options::memory_bytes`] (or, if more, the root diamonds) for surfaces, and some 50 MB at most
-/// for what is on its way, besides the index.
+/// Takes [`Options::memory_bytes`] (or, if more, the root diamonds and what a frame needs to get on), besides the pages of
+/// the index that the cut looks at and 80 bytes for each diamond that it looks at.
 #[derive(Debug)]
 pub struct Terrain {
     /// Of the scene itself, also where it was opened as a server's only one.
@@ -253,6 +257,7 @@ pub struct Terrain {
     options: Options,
     layers: Vec<LayerState>,
     cache: Cache,
+    shares: Shares,
     fetcher: Fetcher,
     decoders: Decoders,
     /// Payloads handed to the decoders, with their bytes, and the sum.
@@ -274,6 +279,8 @@ pub struct Terrain {
     /// What went over the wire for the versions before.
     traffic_before: Traffic,
     opened: Instant,
+    /// Whether the lines around triangles are drawn, which take room on the GPU.
+    wires: bool,
     /// What the last frame saw; nothing before the first.
     planes: Option<[Plane; 5]>,
     stats: Stats,
@@ -316,6 +323,10 @@ struct LayerState {
     ideal: Ideal,
     /// What the cut may take of the memory.
     memory_bytes: usize,
+    /// What of it may be drawn, motions included, in bytes on the GPU.
+    gpu_bytes: u64,
+    /// Pages of the index that are kept beyond those in use.
+    pages_max: usize,
     morphs: Morphs,
     /// Whether it is streamed and drawn.
     shown: bool,
@@ -368,12 +379,15 @@ impl Terrain {
             index: Index::new(layer.forest),
             ideal: Ideal::default(),
             memory_bytes: 0,
+            gpu_bytes: 0,
+            pages_max: 0,
             morphs: Morphs::new(options.morph_seconds),
             shown: true,
         };
         let layers = scene.layers.iter().map(state).collect();
-        let forests = scene.layers.iter().map(|layer| layer.forest).collect();
-        let cache = Cache::new(forests, options.memory_bytes);
+        let forests: Vec<_> = scene.layers.iter().map(|layer| layer.forest).collect();
+        let shares = Shares::of(options.memory_bytes, &forests);
+        let cache = Cache::new(forests, shares.surfaces);
         let scene = Arc::new(scene);
         let shown = options.layers.clone();
         let morph_seconds = options.morph_seconds;
@@ -382,7 +396,8 @@ impl Terrain {
             layers,
             cache,
             fetcher,
-            decoders: Decoders::start(&scene, encoding)?,
+            shares,
+            decoders: Decoders::start(&scene, encoding, shares.done)?,
             scene,
             options,
             pending: HashMap::default(),
@@ -397,6 +412,7 @@ impl Terrain {
             error_pixels: f64::INFINITY,
             traffic_before: Traffic::default(),
             opened,
+            wires: false,
             planes: None,
             stats: Stats::default(),
             view,
@@ -490,6 +506,18 @@ impl Terrain {
         }
     }
 
+    /// Says whether the lines around triangles are drawn, which take room on the GPU.
+    pub fn set_wires(&mut self, wires: bool) {
+        self.wires = wires;
+    }
+
+    /// Why the server is not asked, if it is not: it cannot be reached, or nobody wants it to be. What is drawn then was
+    /// fetched before.
+    #[must_use]
+    pub fn offline(&self) -> Option<String> {
+        self.fetcher.away()
+    }
+
     /// Asks for all that a view needs in one request a layer, the largest errors first: on the way, each frame
     /// draws what is there, and once it has ended, frames ask for what is still missing. It is dropped where
     /// most of it turns out not to be wanted. The camera is as for [`Terrain::frame`]. Streams are of points: in
@@ -548,6 +576,9 @@ impl Terrain {
         self.stats.zone_in_effect = zone.is_some();
         let tolerance = self.options.tolerance_pixels / camera.pixels_per_radian();
         for (number, state) in self.layers.iter_mut().enumerate().filter(|(_, state)| state.shown) {
+            let gpu_bytes_of = |d| self.cache.get((number, d)).map(|surface| surface.gpu_bytes(self.wires));
+            // What moves is drawn beside what it becomes.
+            let gpu_bytes = if state.morphs.is_on() { state.gpu_bytes / 3 * 2 } else { state.gpu_bytes };
             let ask = Ask {
                 layer: &self.scene.layers[number],
                 encoding: self.options.fetch.encoding,
@@ -557,21 +588,24 @@ impl Terrain {
                 sight: self.options.sight,
                 seen: zone.map(|zone| zone.seen(number, tolerance)),
                 memory_bytes: state.memory_bytes,
+                gpu: Some(Gpu { bytes: gpu_bytes, of: &gpu_bytes_of }),
             };
             state.ideal = cut::choose(&ask, |d| state.index.get(d));
             let surface = |d| self.cache.get((number, d)).cloned();
             let mut drawing = cut::draw(number, &ask, &state.ideal, surface);
             if state.morphs.is_on() {
-                view.moving += state.move_on(&ask, number, now, &surface, self.planes.as_ref(), &mut drawing);
+                let last = self.planes.as_ref();
+                view.moving += state.move_on(&ask, number, now, &surface, last, self.wires, &mut drawing);
             }
             self.stats.splits_ideal += state.ideal.len();
             self.stats.splits_drawn += drawing.splits.len();
             view.items.extend(drawing.items);
             view.error_pixels = view.error_pixels.max(drawing.error_pixels);
             view.error_pixels_goal = view.error_pixels_goal.max(drawing.error_pixels_goal);
+            view.limited |= state.ideal.is_limited();
             view.complete &= drawing.wishes.is_empty() && state.ideal.pages().is_empty();
             wishes.extend(drawing.wishes.into_iter().map(|wish| (number, wish)));
-            state.index.trim(PAGES_MAX, state.ideal.seen());
+            state.index.trim(state.pages_max, state.ideal.seen());
         }
         self.planes = Some(camera.planes());
         self.judge_streams(&arrived);
@@ -598,6 +632,7 @@ impl Terrain {
                 sight: self.options.sight,
                 seen: None,
                 memory_bytes: state.memory_bytes,
+                gpu: None,
             };
             let ideal = cut::choose(&ask, |d| state.index.get(d));
             let drawing = cut::draw(number, &ask, &ideal, |d| self.cache.get((number, d)).cloned());
@@ -674,7 +709,7 @@ impl Terrain {
     /// Takes what has been fetched, as far as there is room; the payloads among it.
     fn take_fetched(&mut self) -> Vec<Key> {
         let (mut arrived, mut events) = (Vec::new(), 0);
-        while self.pending_bytes < HELD_BYTES_MAX || events < EVENTS_MIN {
+        while self.pending_bytes < self.shares.held || events < EVENTS_MIN {
             let Some(event) = self.fetcher.poll() else { break };
             events += 1;
             match event {
@@ -746,7 +781,7 @@ impl Terrain {
         // They are few, and do not stand in one another's way.
         let mut wants = imagery;
         wants.reserve(wishes.len());
-        let mut room = HELD_BYTES_MAX.saturating_sub(self.pending_bytes);
+        let mut room = self.shares.held.saturating_sub(self.pending_bytes);
         let mut payloads = wishes.into_iter().peekable();
         while let Some((number, wish)) = payloads.next_if(|(_, wish)| wish.diamond.level() == 0) {
             self.want((number, wish), &mut wants, &mut room);
@@ -799,13 +834,15 @@ impl Terrain {
         self.stats.pages = self.layers.iter().map(|state| state.index.pages()).sum();
         self.stats.decoding = self.pending.len();
         self.stats.failed = self.failed.len();
+        self.stats.offline = self.fetcher.is_away();
         self.stats.frame_seconds = started.elapsed().as_secs_f64();
     }
 }
 
 impl LayerState {
     /// Goes on with the motions that lead to `drawing`, and puts what they look like `now` in its place. Returns how
-    /// many diamonds move.
+    /// many diamonds move; none where the GPU has no room for them.
+    #[allow(clippy::too_many_arguments, reason = "a change is told by so many things, each of its own type")]
     fn move_on(
         &mut self,
         ask: &Ask,
@@ -813,6 +850,7 @@ impl LayerState {
         now: Moment,
         surface: &impl Fn(Diamond) -> Option<Arc<Surface>>,
         last: Option<&[Plane; 5]>,
+        wires: bool,
         drawing: &mut Drawing,
     ) -> usize {
         // Nothing is drawn while a root is missing, and where nothing was drawn, nothing moves.
@@ -826,6 +864,10 @@ impl LayerState {
         let moving = cut.moving();
         if moving > 0 {
             let showing = cut::show(number, ask, &self.ideal, entry, &cut, now);
+            if showing.items.iter().map(|item| item.gpu_bytes(wires)).sum::<u64>() > self.gpu_bytes {
+                self.morphs.jump(&drawing.splits);
+                return 0;
+            }
             drawing.items = showing.items;
             drawing.error_pixels = drawing.error_pixels.max(showing.error_pixels);
             drawing.splits = cut.shown.iter().map(|shown| shown.diamond).collect();

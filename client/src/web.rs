@@ -112,6 +112,7 @@ fn options(address: &Address) -> Result<terrain::Options, String> {
     Ok(terrain::Options {
         tolerance_pixels,
         memory_bytes: MEMORY_BYTES,
+        gpu_bytes: GPU_BYTES,
         morph_seconds: if encoding == Encoding::Points { MORPH_SECONDS } else { 0.0 },
         // Half of what a window takes: as much again is on the GPU.
         texture_bytes: 64 << 20,

@@ -500,6 +500,11 @@ impl Serving {
 
 impl Served {
     pub(crate) fn start(layers: usize, faults: Faults) -> Self {
+        Self::start_at("127.0.0.1:0", layers, faults)
+    }
+
+    /// As [`Served::start`], where another one was before.
+    pub(crate) fn start_at(address: &str, layers: usize, faults: Faults) -> Self {
         let state = Arc::new(Serving {
             scene: scene(layers),
             faults: Mutex::new(faults),
@@ -529,7 +534,7 @@ impl Served {
             .with_state(Arc::clone(&state));
         let runtime =
             tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
-        let listener = runtime.block_on(tokio::net::TcpListener::bind("127.0.0.1:0")).unwrap();
+        let listener = runtime.block_on(tokio::net::TcpListener::bind(address)).unwrap();
         let url = format!("http://{}", listener.local_addr().unwrap());
         runtime.spawn(async move { axum::serve(listener, router).await });
         Self { url, state, runtime: Some(runtime) }

@@ -22,6 +22,7 @@ fn ask<'a>(built: &'a Built, camera: &'a Camera, tolerance_pixels: f64) -> Ask<'
         sight,
         seen: None,
         memory_bytes: usize::MAX,
+        gpu: None,
     }
 }
 

@@ -117,6 +117,15 @@ pub enum FetchError {
         /// The layers that there are.
         layers: Vec<String>,
     },
+    /// The server is not asked, and it was never fetched.
+    #[error(
+        "{route} is not among what was fetched before: open the scene once while the server can be reached, with the same \
+         --disk-cache and token"
+    )]
+    NotKept {
+        /// What was asked for.
+        route: String,
+    },
     /// No thread or no HTTP client.
     #[error("cannot start fetching: {0}: close other programs, or raise the limit on threads (ulimit -u)")]
     Start(String),

@@ -136,6 +136,8 @@ pub(super) struct Counters {
     pub(super) round_trips: AtomicU64,
     pub(super) errors: AtomicU64,
     pub(super) cancelled: AtomicU64,
+    disk_bytes: AtomicU64,
+    disk_blobs: AtomicU64,
 }
 
 impl Counters {
@@ -147,7 +149,15 @@ impl Counters {
             round_trips: read(&self.round_trips),
             errors: read(&self.errors),
             cancelled: read(&self.cancelled),
+            disk_bytes: read(&self.disk_bytes),
+            disk_blobs: read(&self.disk_blobs),
         }
+    }
+
+    /// Counts what was found on the disk.
+    pub(super) fn found(&self, bytes: usize) {
+        count(&self.disk_bytes, bytes);
+        count(&self.disk_blobs, 1);
     }
 }
 
@@ -213,33 +223,22 @@ impl Http {
             .map_err(|e| FetchError::Json { route: route.to_owned(), reason: e.to_string() })
     }
 
-    /// The masks of a scene's zone, one a layer, of the diamonds of these forests.
-    pub(super) async fn masks(
-        &self,
-        scene: &Scene,
-        forests: &[Forest],
-        zone: &str,
-    ) -> Result<Vec<Mask>, FetchError> {
+    /// The masks of a scene's zone as they come.
+    pub(super) async fn masks(&self, route: &str) -> Result<Vec<u8>, FetchError> {
         count(&self.traffic.round_trips, 1);
-        let route = message::zone_route(&scene.name, &scene.version, zone);
         let mut tries = 0;
-        let blob = loop {
+        loop {
             tries += 1;
-            match self.whole(&route, ZONE_BYTES_MAX).await {
+            match self.whole(route, ZONE_BYTES_MAX).await {
                 Err(error) if tries < TRIES_MAX && is_passing(&error) => {
                     count(&self.traffic.errors, 1);
                     let asked =
                         if let FetchError::Status { retry_after, .. } = error { retry_after } else { None };
                     sleep(pause(tries, asked)).await;
                 }
-                answer => break answer?,
+                answer => return answer,
             }
-        };
-        let wrong = |reason: String| FetchError::Zone { zone: zone.to_owned(), reason };
-        let limit = zone::bytes_max(forests);
-        let bytes = unpack(&blob, limit)
-            .ok_or_else(|| wrong(format!("they do not decompress to at most {limit} bytes")))?;
-        zone::decode(forests, &bytes).map_err(|e| wrong(e.to_string()))
+        }
     }
 
     /// The description of the scene of this name, or of the only one.
@@ -270,6 +269,15 @@ impl Http {
         check(&scene).map_err(|reason| FetchError::Scene { scene: shortened(&scene.name), reason })?;
         Ok(scene)
     }
+}
+
+/// The masks of a zone, one a layer, of the diamonds of these forests, from what came over the wire.
+pub(super) fn decode_masks(forests: &[Forest], zone: &str, blob: &[u8]) -> Result<Vec<Mask>, FetchError> {
+    let wrong = |reason: String| FetchError::Zone { zone: zone.to_owned(), reason };
+    let limit = zone::bytes_max(forests);
+    let bytes = unpack(blob, limit)
+        .ok_or_else(|| wrong(format!("they do not decompress to at most {limit} bytes")))?;
+    zone::decode(forests, &bytes).map_err(|e| wrong(e.to_string()))
 }
 
 /// Whether the same request may succeed a little later.

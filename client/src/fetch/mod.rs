@@ -16,6 +16,7 @@
 //! | `connect` | how a server is reached: encryption, proxies, tokens |
 //! | `http` | addresses, answers and their limits, what goes over the wire |
 //! | `tasks` | the wishes and the tasks that fulfil them |
+//! | `kept` | what was fetched before, and what to do while the server is away |
 //! | `stream` | what comes without being wished for, and when it ends |
 //! | `once` | one request, sent once and timed |
 //! | `batch` | batches: put together, and cut from a stream of bytes |
@@ -26,6 +27,7 @@ mod batch;
 pub(crate) mod connect;
 mod error;
 mod http;
+mod kept;
 #[cfg(not(target_arch = "wasm32"))]
 mod once;
 mod stream;
@@ -45,6 +47,7 @@ pub(crate) use http::{check as check_scene, decode_page, transport};
 pub(crate) use once::{Answer, Ask, describe, one};
 
 use crate::background::Background;
+use crate::disk::Disk;
 use crate::encoding::Encoding;
 use bytes::Bytes;
 use diamantina_protocol::diamond::Diamond;
@@ -58,7 +61,7 @@ use std::collections::HashSet;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, mpsc};
 use std::time::Duration;
-use tasks::{Shared, work};
+use tasks::{Shared, State, work};
 use tokio::sync::{Notify, oneshot};
 
 /// Bytes of payloads asked for in one batch, where the index tells: about a second at 2 Mbit/s.
@@ -87,12 +90,17 @@ pub struct Options {
     pub encoding: Encoding,
     /// Shown with each request, for private scenes.
     pub token: Option<Arc<str>>,
+    /// Where what is fetched is kept, and looked for before it is asked for.
+    pub disk: Option<Disk>,
+    /// Ask the disk alone, and never the network.
+    pub offline: bool,
 }
 
 impl Default for Options {
     fn default() -> Self {
         let encoding = Encoding::default();
-        Self { requests_max: 8, patience: Duration::from_secs(15), encoding, token: None }
+        let (disk, offline) = (None, false);
+        Self { requests_max: 8, patience: Duration::from_secs(15), encoding, token: None, disk, offline }
     }
 }
 
@@ -148,6 +156,10 @@ pub struct Traffic {
     pub errors: u64,
     /// Requests dropped because nobody wanted the answer any more.
     pub cancelled: u64,
+    /// What was found on the disk instead, in bytes ...
+    pub disk_bytes: u64,
+    /// ... and in payloads and pages.
+    pub disk_blobs: u64,
 }
 
 impl Traffic {
@@ -160,6 +172,8 @@ impl Traffic {
             round_trips: self.round_trips + other.round_trips,
             errors: self.errors + other.errors,
             cancelled: self.cancelled + other.cancelled,
+            disk_bytes: self.disk_bytes + other.disk_bytes,
+            disk_blobs: self.disk_blobs + other.disk_blobs,
         }
     }
 }
@@ -193,7 +207,8 @@ pub struct Fetcher {
 
 impl Fetcher {
     /// Reads the scene's description and starts. `url` is that of a scene, `http://HOST:PORT/scenes/NAME` (or https),
-    /// or of a server with only one. Layers that are offered in the encoding asked for come as they are streamed in it: see
+    /// or of a server with only one. Where a disk keeps it and the server is away, it is the description of the last time:
+    /// see [`Fetcher::away`]. Layers that are offered in the encoding asked for come as they are streamed in it: see
     /// [`Encoding::layer`].
     ///
     /// # Errors
@@ -208,15 +223,18 @@ impl Fetcher {
             patience: options.patience,
             traffic: Counters::default(),
         };
+        let shelf = options.disk.as_ref().map(|disk| disk.shelf(&http.base, options.token.as_deref()));
+        let (place, offline) = (shelf.clone(), options.offline);
         // Whoever awaits this may stand in a runtime of its own, or in none.
         let (sender, receiver) = oneshot::channel();
         background.spawn(async move {
-            let found = http.scene(name.as_deref()).await;
+            let found = kept::describe(&http, place.as_ref(), name.as_deref(), offline).await;
             // Whoever asked waits for this.
             let _ = sender.send((http, found));
         });
-        let (http, scene) = receiver.await.map_err(|e| start(&e))?;
-        let mut scene = scene?;
+        let (http, found) = receiver.await.map_err(|e| start(&e))?;
+        let (mut scene, away) = found?;
+        let is_watched = shelf.is_some() && !offline;
         let forests = scene.layers.iter().map(|layer| layer.forest).collect();
         for layer in &mut scene.layers {
             if let Some(streamed) = options.encoding.layer(layer) {
@@ -231,7 +249,8 @@ impl Fetcher {
             encoding: options.encoding,
             forests,
             requests_max,
-            state: Mutex::default(),
+            shelf,
+            state: Mutex::new(State::new(away)),
             changed: Notify::new(),
             taken: Notify::new(),
             waiting_bytes: AtomicUsize::new(0),
@@ -239,6 +258,9 @@ impl Fetcher {
         });
         for _ in 0..requests_max {
             background.spawn(work(Arc::clone(&shared)));
+        }
+        if is_watched {
+            background.spawn(kept::watch(Arc::clone(&shared)));
         }
         Ok((Self { shared, events, seen: 0, background }, scene))
     }
@@ -268,7 +290,7 @@ impl Fetcher {
         let (shared, zone) = (Arc::clone(&self.shared), zone.to_owned());
         self.background.spawn(async move {
             // Whoever asked waits for this.
-            let _ = sender.send(shared.http.masks(&shared.scene, &shared.forests, &zone).await);
+            let _ = sender.send(shared.masks(&zone).await);
         });
         async { receiver.await.map_err(|e| FetchError::Start(e.to_string()))? }
     }
@@ -340,6 +362,7 @@ impl Fetcher {
 
     /// Says that what arrived for `key` was no good. It is fetched again, after a pause.
     pub fn refuse(&mut self, key: Key, error: &FetchError) {
+        self.shared.forget(|| self.shared.route(key));
         let mut state = self.shared.lock();
         state.delivered.remove(&key);
         self.shared.fail(&mut state, &[key], error);
@@ -354,6 +377,19 @@ impl Fetcher {
             && state.streams.is_empty()
             && !state.wishes.is_empty()
             && state.wishes.iter().all(rests)
+    }
+
+    /// Why the server is not asked, if it is not: it cannot be reached, or nobody wants it to be. What was fetched before is
+    /// there all the same.
+    #[must_use]
+    pub fn away(&self) -> Option<String> {
+        self.shared.lock().away.clone()
+    }
+
+    /// Whether the server is not asked: see [`Fetcher::away`].
+    #[must_use]
+    pub fn is_away(&self) -> bool {
+        self.shared.lock().away.is_some()
     }
 
     /// What has gone over the wire so far.

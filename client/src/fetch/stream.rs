@@ -76,9 +76,11 @@ impl Shared {
             while let Some((header, blob)) = frames.take()? {
                 match ledger.enter(&header, &blob)? {
                     Entered::Page(number, entries) => {
+                        self.keep(|| self.route(Key::Page(layer, number)), 0, &blob);
                         self.deliver(Key::Page(layer, number), Event::Page(layer, number, entries));
                     }
                     Entered::Diamond(d) => {
+                        self.keep(|| self.route(Key::Diamond(layer, d)), d.level(), &blob);
                         self.deliver(Key::Diamond(layer, d), Event::Payload(layer, d, blob));
                     }
                 }

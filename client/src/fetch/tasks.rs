@@ -6,6 +6,7 @@ use super::stream::weight;
 use super::unpack::unpack;
 use super::{Event, FetchError, Key, REST, TRIES_MAX, Want};
 use crate::background::within;
+use crate::disk::Shelf;
 use crate::encoding::Encoding;
 use bytes::Bytes;
 use diamantina_protocol::bintree::Forest;
@@ -28,6 +29,8 @@ pub(super) struct Shared {
     /// Those of the layers' points.
     pub(super) forests: Vec<Forest>,
     pub(super) requests_max: usize,
+    /// What was fetched before.
+    pub(super) shelf: Option<Shelf>,
     // A std Mutex: nothing awaits while it is held, nor does more than look through the wishes.
     pub(super) state: Mutex<State>,
     pub(super) changed: Notify,
@@ -49,6 +52,10 @@ pub(super) struct State {
     /// What arrived, with the number of its event, until the frame has seen it.
     pub(super) delivered: HashMap<Key, u64, RandomState>,
     pub(super) failures: HashMap<Key, Failure, RandomState>,
+    /// Whether requests end at the disk, and why.
+    pub(super) away: Option<String>,
+    /// When the first of the requests failed that have not reached the server.
+    pub(super) silent_since: Option<Instant>,
     /// Events and requests so far.
     serial: u64,
     flight: u64,
@@ -64,12 +71,14 @@ pub(super) struct Flight {
     pub(super) stream: Option<usize>,
     /// Whether something of it has arrived.
     useful: bool,
+    /// Whether it has gone to the network.
+    pub(super) is_out: bool,
 }
 
 #[derive(Debug)]
 pub(super) struct Failure {
     pub(super) tries: u32,
-    not_before: Instant,
+    pub(super) not_before: Instant,
 }
 
 /// What a task does next.
@@ -78,7 +87,7 @@ enum Next {
     Wait(Option<Instant>),
 }
 
-enum Request {
+pub(super) enum Request {
     Page(usize, u32),
     Coverage(usize),
     Tile(usize, Tile),
@@ -87,6 +96,11 @@ enum Request {
 }
 
 impl State {
+    /// Where nothing has been wished for yet.
+    pub(super) fn new(away: Option<String>) -> Self {
+        Self { away, ..Self::default() }
+    }
+
     /// Drops the streams of some layers.
     pub(super) fn end_streams(&mut self, of: impl Fn(usize) -> bool) {
         self.streams.retain(|(layer, _)| !of(*layer));
@@ -115,7 +129,7 @@ pub(super) async fn work(shared: Arc<Shared>) {
             }
             Next::Fetch { id, cancel, request } => {
                 let done = tokio::select! {
-                    done = shared.fetch(&request) => Some(done),
+                    done = shared.fetch(id, &request) => Some(done),
                     () = cancel.notified() => None,
                 };
                 let gone = matches!(&done, Some(Err(FetchError::Status { status: 404 | 410, .. })));
@@ -202,9 +216,6 @@ impl Shared {
             },
             _ => return Next::Wait(soonest),
         };
-        if state.flights.is_empty() {
-            count(&self.http.traffic.round_trips, 1);
-        }
         state.flight += 1;
         let id = state.flight;
         match &request {
@@ -226,42 +237,70 @@ impl Shared {
         let is_page = matches!(request, Request::Page(..));
         let is_tile = matches!(request, Request::Coverage(_) | Request::Tile(..));
         let stream = if let Request::Stream(layer, _) = &request { Some(*layer) } else { None };
-        state
-            .flights
-            .insert(id, Flight { cancel: Arc::clone(&cancel), is_page, is_tile, stream, useful: false });
+        let flight =
+            Flight { cancel: Arc::clone(&cancel), is_page, is_tile, stream, useful: false, is_out: false };
+        state.flights.insert(id, flight);
         Next::Fetch { id, cancel, request }
     }
 
-    async fn fetch(&self, request: &Request) -> Result<(), FetchError> {
+    async fn fetch(&self, id: u64, request: &Request) -> Result<(), FetchError> {
         let Scene { layers, .. } = &self.scene;
         match request {
             Request::Page(layer, number) => {
                 let layer_of = &layers[*layer];
                 let route = self.encoding.index_route(&self.scene, *layer, *number);
+                if let Some(blob) = self.kept(&route).await {
+                    if let Ok(entries) = decode_page(&layer_of.forest, *number, &blob) {
+                        self.deliver(Key::Page(*layer, *number), Event::Page(*layer, *number, entries));
+                        return Ok(());
+                    }
+                    self.forget(|| route.clone());
+                }
+                self.go_out(id, request)?;
                 let body = self.http.whole(&route, PAGE_BYTES_MAX).await?;
                 let entries = decode_page(&layer_of.forest, *number, &body)?;
+                self.keep(|| route, 0, &body.into());
                 self.deliver(Key::Page(*layer, *number), Event::Page(*layer, *number, entries));
                 Ok(())
             }
             Request::Coverage(number) => {
                 let texture = &self.scene.textures[*number];
-                let Scene { name, version, .. } = &self.scene;
-                let route = message::index_route(name, version, &texture.name, 0);
+                let route = self.route(Key::Coverage(*number));
+                let read = |packed: &[u8]| {
+                    let bytes = unpack(packed, coverage_bytes(texture))?;
+                    Coverage::decode(texture, &bytes).ok()
+                };
+                if let Some(coverage) = self.kept(&route).await.and_then(|packed| read(&packed)) {
+                    self.deliver(Key::Coverage(*number), Event::Coverage(*number, coverage));
+                    return Ok(());
+                }
+                self.go_out(id, request)?;
                 let body = self.http.whole(&route, COVERAGE_BYTES_MAX).await?;
-                let damaged = || FetchError::Coverage(texture.name.clone());
-                let bytes = unpack(&body, coverage_bytes(texture)).ok_or_else(damaged)?;
-                let coverage = Coverage::decode(texture, &bytes).map_err(|_| damaged())?;
+                let coverage = read(&body).ok_or_else(|| FetchError::Coverage(texture.name.clone()))?;
+                self.keep(|| route, 0, &body.into());
                 self.deliver(Key::Coverage(*number), Event::Coverage(*number, coverage));
                 Ok(())
             }
             Request::Tile(number, tile) => {
-                let texture = &self.scene.textures[*number].name;
-                let route = message::tile_route(&self.scene.name, &self.scene.version, texture, *tile);
-                let picture = self.http.whole(&route, TILE_BYTES_MAX).await?;
-                self.deliver(Key::Tile(*number, *tile), Event::Tile(*number, *tile, picture.into()));
+                let key = Key::Tile(*number, *tile);
+                let route = self.route(key);
+                if let Some(picture) = self.kept(&route).await {
+                    self.deliver(key, Event::Tile(*number, *tile, picture));
+                    return Ok(());
+                }
+                self.go_out(id, request)?;
+                let picture: Bytes = self.http.whole(&route, TILE_BYTES_MAX).await?.into();
+                // A level halves texels along both sides, as two levels of diamonds do.
+                self.keep(|| route, 2 * tile.level, &picture);
+                self.deliver(key, Event::Tile(*number, *tile, picture));
                 Ok(())
             }
             Request::Batch(layer, wants) => {
+                let wants = self.deliver_kept(*layer, wants).await;
+                if wants.is_empty() {
+                    return Ok(());
+                }
+                self.go_out(id, request)?;
                 let centres: Vec<_> = wants.iter().map(|(d, _)| d.centre()).collect();
                 let route = self.encoding.batch_route(&self.scene, *layer, &centres);
                 let mut chunks = self.http.get(&route).await?;
@@ -284,7 +323,10 @@ impl Shared {
                     None => Err(FetchError::Early(shortened(&route))),
                 }
             }
-            Request::Stream(layer, ask) => self.stream(*layer, ask).await,
+            Request::Stream(layer, ask) => {
+                self.go_out(id, request)?;
+                self.stream(*layer, ask).await
+            }
         }
     }
 
@@ -298,6 +340,7 @@ impl Shared {
         payload: Bytes,
     ) -> Result<(), FetchError> {
         good_payload(d, bytes, header, &payload)?;
+        self.keep(|| self.route(Key::Diamond(layer, d)), d.level(), &payload);
         self.deliver(Key::Diamond(layer, d), Event::Payload(layer, d, payload));
         Ok(())
     }
@@ -354,7 +397,11 @@ impl Shared {
     /// Ends a request; `done` is `None` if it was dropped.
     fn land(&self, id: u64, done: Option<Result<(), FetchError>>) {
         let mut state = self.lock();
-        let useful = state.flights.remove(&id).is_some_and(|flight| flight.useful);
+        let flight = state.flights.remove(&id);
+        let useful = flight.as_ref().is_some_and(|flight| flight.useful);
+        if flight.is_some_and(|flight| flight.is_out) {
+            self.judge(&mut state, done.as_ref());
+        }
         let owed: Vec<Key> = state.flying.iter().filter(|(_, f)| **f == id).map(|(key, _)| *key).collect();
         for key in &owed {
             state.flying.remove(key);
@@ -362,6 +409,8 @@ impl Shared {
         match done {
             None => count(&self.http.traffic.cancelled, 1),
             Some(Ok(())) => {}
+            // Wherever it failed: until the server is back there is no use in trying.
+            Some(Err(_)) if state.away.is_some() => self.rest(&mut state, &owed),
             // Cut off, or garbled from some byte on, but not in vain: what it owes has not failed in itself.
             Some(Err(
                 FetchError::Early(_)
@@ -393,7 +442,7 @@ impl Shared {
         }
     }
 
-    fn stop(&self) {
+    pub(super) fn stop(&self) {
         let mut state = self.lock();
         if !state.stopped {
             state.stopped = true;

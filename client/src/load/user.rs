@@ -8,7 +8,7 @@ use crate::camera::Camera;
 use crate::cut::{self, Ask};
 use crate::encoding::Encoding;
 use crate::fetch::{Answer, Ask as Request, one};
-use crate::headless::{FlightPath, PathKey};
+use crate::headless::{Dice, FlightPath, PathKey};
 use crate::overview::extent;
 use crate::sight::Sight;
 use bytes::Bytes;
@@ -31,20 +31,6 @@ const PAUSE: Duration = Duration::from_millis(500);
 
 /// Places that a user without a path looks at, again and again.
 const PLACES: u32 = 512;
-
-/// Numbers that look random, the same from the same beginning (splitmix64).
-struct Dice(u64);
-
-impl Dice {
-    /// From 0 to below 1.
-    fn roll(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut v = self.0;
-        v = (v ^ v >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        v = (v ^ v >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((v ^ v >> 31) >> 11) as f64 / (1u64 << 53) as f64
-    }
-}
 
 /// Somewhere else again and again: mostly near the last place, as people look around, and low over the ground.
 fn wandering(scene: &Scene, dice: &mut Dice) -> FlightPath {
@@ -200,6 +186,7 @@ impl User {
                 sight: Sight::default(),
                 seen: None,
                 memory_bytes: state.memory_bytes,
+                gpu: None,
             };
             let ideal = cut::choose(&ask, |d| state.index.get(d));
             let drawing = cut::draw(number, &ask, &ideal, |d| self.cache.get((number, d)).cloned());

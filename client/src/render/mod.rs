@@ -68,7 +68,9 @@ pub struct Options {
     pub format: wgpu::TextureFormat,
     /// Samples a pixel: 1, or 4 to smooth edges.
     pub samples: u32,
-    /// Bytes of GPU memory for surfaces; those that a frame draws are kept whatever they take.
+    /// Bytes of GPU memory for surfaces and their motions; those that a frame draws are kept whatever they take: that they
+    /// fit is the cut's business. Pictures between passes and what all diamonds share come on top:
+    /// see [`FrameStats::fixed_bytes`].
     pub budget_bytes: u64,
     /// Steps that imagery seen at a slant is sampled in, 1 to 16: more is sharper.
     pub anisotropy: u16,
@@ -95,8 +97,11 @@ pub struct FrameStats {
     pub draws: u32,
     /// Bytes of surfaces uploaded for this frame.
     pub uploaded_bytes: u64,
-    /// Bytes of GPU memory that surfaces take.
+    /// Bytes of GPU memory that surfaces and their motions take: what the budget is about.
     pub gpu_bytes: u64,
+    /// Bytes of GPU memory that the picture's size and the water in view alone decide upon: depth, samples, what is mirrored and seen
+    /// through, and the index lists that all diamonds share.
+    pub fixed_bytes: u64,
 }
 
 /// What helps where there is no adapter, and where there is no device.
@@ -367,6 +372,9 @@ impl Renderer {
             }
             lens.draw_sky(&mut pass, &self.sky, look);
         }
+        stats.fixed_bytes = self.residents.shared_bytes()
+            + attachments.bytes(&self.options)
+            + water.as_ref().map_or(0, WaterPasses::bytes);
         (self.lens, self.water, self.attachments) = (Some(lens), water, Some(attachments));
         self.queue.submit([encoder.finish()]);
         stats
@@ -622,6 +630,12 @@ impl Attachments {
         };
         let colour = (options.samples > 1).then(|| view("samples", options.format));
         Self { size, depth: view("depth", DEPTH), colour }
+    }
+
+    /// Bytes of GPU memory that they take: four a sample of depth, and as many of colour.
+    fn bytes(&self, options: &Options) -> u64 {
+        let samples = self.size.map(u64::from).iter().product::<u64>() * u64::from(options.samples);
+        samples * if self.colour.is_some() { 8 } else { 4 }
     }
 }
 

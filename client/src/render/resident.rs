@@ -2,7 +2,8 @@
 //!
 //! A grid takes 8 bytes a point (66 kB for n = 64), if it has nodata, its own index lists (up to 98 kB), and, as
 //! long as it moves, 20 bytes a point (166 kB). Irregular triangles take 16 bytes a vertex and 6 a triangle. The lines
-//! around triangles, once they are drawn, take twice as much as their index lists. Those that the present frame draws always stay; of the others, the longest unseen go first.
+//! around triangles, once they are drawn, take twice as much as their index lists. Those that the present frame draws always stay
+//! (the cut sees to it that they fit); of the others, the longest unseen go first, before new ones come.
 
 use crate::camera::Bounds;
 use crate::drawing::DrawItem;
@@ -90,6 +91,11 @@ impl Residents {
         self.bytes
     }
 
+    /// Bytes of GPU memory that all diamonds of a form share.
+    pub(super) fn shared_bytes(&self) -> u64 {
+        self.by_form.values().map(|grid| grid.places.size() + grid.triangles.bytes()).sum()
+    }
+
     pub(super) fn get(&self, item: &DrawItem) -> Option<&Resident> {
         self.by_key.get(&(item.layer, item.diamond))
     }
@@ -109,6 +115,14 @@ impl Residents {
         wires: bool,
     ) -> u64 {
         self.frame += 1;
+        let mut coming_bytes = 0;
+        for item in items {
+            match self.by_key.get_mut(&(item.layer, item.diamond)) {
+                Some(resident) => resident.last_frame = self.frame,
+                None => coming_bytes += item.gpu_bytes(wires),
+            }
+        }
+        self.shrink(self.budget_bytes.saturating_sub(coming_bytes));
         let mut uploaded_bytes = 0;
         for item in items {
             let Some(layer) = layers.get(item.layer) else { continue };
@@ -142,20 +156,20 @@ impl Residents {
                 self.bytes -= old.bytes;
             }
         }
-        self.shrink();
+        self.shrink(self.budget_bytes);
         uploaded_bytes
     }
 
-    /// Drops what this frame does not draw, longest unseen first, until the rest fits the budget.
-    fn shrink(&mut self) {
-        if self.bytes <= self.budget_bytes {
+    /// Drops what this frame does not draw, longest unseen first, until the rest takes no more than that.
+    fn shrink(&mut self, bytes_max: u64) {
+        if self.bytes <= bytes_max {
             return;
         }
         let idle = self.by_key.iter().filter(|(_, r)| r.last_frame < self.frame);
         let mut idle: Vec<(u64, Key)> = idle.map(|(key, r)| (r.last_frame, *key)).collect();
         idle.sort_unstable();
         for (_, key) in idle {
-            if self.bytes <= self.budget_bytes {
+            if self.bytes <= bytes_max {
                 break;
             }
             if let Some(old) = self.by_key.remove(&key) {

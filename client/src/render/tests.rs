@@ -500,7 +500,12 @@ fn surfaces_are_uploaded_once_and_dropped_over_budget() {
     let budget_bytes = one * (fine.len() as u64);
     let mut offscreen = offscreen(1, budget_bytes);
     let stats = offscreen.draw(layers, &camera, &coarse, &PLAIN).unwrap();
-    assert_eq!(stats, FrameStats { triangles: 64, draws: 1, uploaded_bytes: one, gpu_bytes: one });
+    let fixed_bytes = stats.fixed_bytes;
+    assert_eq!(
+        stats,
+        FrameStats { triangles: 64, draws: 1, uploaded_bytes: one, gpu_bytes: one, fixed_bytes }
+    );
+    assert!(fixed_bytes > 64 * 64 * 4, "depth, and the index lists that all share");
     assert_eq!(offscreen.draw(layers, &camera, &coarse, &PLAIN).unwrap().uploaded_bytes, 0);
     // Another surface of the same diamond takes the place of the first.
     let again: Vec<_> = coarse
@@ -523,7 +528,7 @@ fn sizes_and_unknown_layers_are_refused() {
     assert!(matches!(result, Err(RenderError::Size { found: [0, 4], .. })));
     // Nothing is drawn without its layer.
     let stats = offscreen.draw(&[], &world.overhead([5, 3]), &world.level(1), &PLAIN).unwrap();
-    assert_eq!(stats, FrameStats::default());
+    assert_eq!(stats, FrameStats { fixed_bytes: 5 * 3 * 4 * 8, ..FrameStats::default() });
     assert!(is_background(&offscreen.read().unwrap(), 4, 2));
 }
 

@@ -196,6 +196,12 @@ impl WaterPasses {
         }
     }
 
+    /// Bytes of GPU memory that its pictures take: four a pixel of colour, and four of depth.
+    pub(super) fn bytes(&self) -> u64 {
+        let sheets = self.mirrors.values().map(|mirror| &mirror.sheet).chain([&self.scene]);
+        sheets.map(|sheet| 8 * sheet.size.map(u64::from).iter().product::<u64>()).sum()
+    }
+
     /// Draws what the layers of water in view mirror, and what is seen through them. `water` is sorted by layer.
     #[allow(clippy::too_many_arguments, reason = "a frame is told by so many things, each of its own type")]
     pub(super) fn prepare(

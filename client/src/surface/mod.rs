@@ -91,6 +91,26 @@ impl Surface {
         }
     }
 
+    /// Bytes of GPU memory that it takes at most, motions aside; with `wires` also the lines around its triangles.
+    #[must_use]
+    pub fn gpu_bytes(&self, wires: bool) -> u64 {
+        let (vertices, indices) = match self {
+            Self::Points(points) => points.gpu_bytes(),
+            Self::Tin(tin) => (size_of_val(tin.corners()), 2 * tin.indices().len() + 2),
+        };
+        (vertices + indices * if wires { 3 } else { 1 }) as u64
+    }
+
+    /// The same, before it is there, as is usual: where there are data all over it.
+    #[must_use]
+    pub fn expected_gpu_bytes(encoding: Encoding, forest: &Forest, level: u32, payload_bytes: u32) -> u64 {
+        let bytes = match encoding {
+            Encoding::Points => Points::expected_gpu_bytes(forest, level),
+            Encoding::Tin => Tin::expected_bytes(payload_bytes),
+        };
+        bytes as u64
+    }
+
     /// Bytes of memory that a diamond's surface will take, before it is there: exactly so for points; for irregular
     /// triangles as many as those of so long a payload usually take at most.
     #[must_use]

@@ -16,6 +16,16 @@ use diamantina_protocol::diamond::{Block, Diamond, walk_shared};
 use diamantina_protocol::message::Layer;
 use diamantina_protocol::points::{self, DecodeError, Tally};
 
+/// Bytes of a point on the GPU: a height and a normal.
+pub(crate) const GPU_POINT_BYTES: usize = 8;
+
+/// Points of the surface of a diamond of a level.
+fn slots(forest: &Forest, level: u32) -> usize {
+    let n = forest.segments_at(level);
+    let centres = if forest.adds_points(level) || level % 2 == 1 { n * n } else { 0 };
+    (n + 1).pow(2) + centres
+}
+
 /// The heights and slopes of a split diamond.
 ///
 /// Takes `12 ((n+1)^2 + n^2)` bytes: 100 kB for n = 64.
@@ -143,8 +153,19 @@ impl Points {
     /// Bytes of memory that the surface of a diamond of a level takes, with what a cache notes of it.
     #[must_use]
     pub fn bytes(forest: &Forest, level: u32) -> usize {
-        let n = forest.segments_at(level);
-        let centres = if forest.adds_points(level) || level % 2 == 1 { n * n } else { 0 };
-        12 * ((n + 1).pow(2) + centres) + size_of::<Self>()
+        12 * slots(forest, level) + size_of::<Self>()
+    }
+
+    /// Bytes of GPU memory that points and index lists take at most: those that have nodata have lists of their own.
+    pub(super) fn gpu_bytes(&self) -> (usize, usize) {
+        let n = self.block.segments();
+        // Four triangles a cell, or two, of three indices each.
+        let lists = if self.block.has_centres() { 24 * n * n } else { 12 * n * n };
+        (GPU_POINT_BYTES * self.slopes.len(), if self.has_nodata { lists } else { 0 })
+    }
+
+    /// Bytes of GPU memory that a surface of a level without nodata takes.
+    pub(super) fn expected_gpu_bytes(forest: &Forest, level: u32) -> usize {
+        GPU_POINT_BYTES * slots(forest, level)
     }
 }

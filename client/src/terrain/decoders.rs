@@ -1,7 +1,6 @@
 //! Decodes payloads whose parents are there, and holds the others: on threads, or, where there are none, between
 //! frames, a slice after the other.
 
-use super::DONE_MAX;
 use crate::background::{Background, HAS_THREADS, sleep};
 use crate::cache::Key;
 use crate::encoding::Encoding;
@@ -47,13 +46,15 @@ pub(super) struct Decoders {
 struct Bench {
     scene: Arc<Scene>,
     encoding: Encoding,
+    /// Surfaces that may wait for a frame.
+    done_max: usize,
     state: Mutex<Jobs>,
     changed: Condvar,
 }
 
 #[derive(Debug, Default)]
 struct Jobs {
-    /// Without all their parents. Bounded with `ready` by [`super::HELD_BYTES_MAX`] and the ideal cut.
+    /// Without all their parents. Bounded with `ready` by what the terrain holds and the ideal cut.
     held: HashMap<Key, Job, RandomState>,
     ready: VecDeque<(Key, Job)>,
     /// What no frame has taken yet, in the order of decoding, so parents before children.
@@ -66,10 +67,12 @@ struct Jobs {
 }
 
 impl Decoders {
-    pub(super) fn start(scene: &Arc<Scene>, encoding: Encoding) -> std::io::Result<Self> {
+    /// Threads, which pause where so many surfaces wait for a frame.
+    pub(super) fn start(scene: &Arc<Scene>, encoding: Encoding, done_max: usize) -> std::io::Result<Self> {
         let shared = Arc::new(Bench {
             scene: Arc::clone(scene),
             encoding,
+            done_max,
             state: Mutex::default(),
             changed: Condvar::new(),
         });
@@ -115,7 +118,7 @@ impl Decoders {
     pub(super) fn take(&self) -> Vec<Decoded> {
         let mut jobs = self.shared.lock();
         jobs.fresh.clear();
-        if jobs.done.len() >= DONE_MAX {
+        if jobs.done.len() >= self.shared.done_max {
             self.shared.changed.notify_all();
         }
         self.call(&mut jobs);
@@ -188,7 +191,7 @@ impl Bench {
 
     /// Decodes a payload, if one is ready and there is room for what becomes of it.
     fn one<'a>(&'a self, mut jobs: MutexGuard<'a, Jobs>) -> (MutexGuard<'a, Jobs>, bool) {
-        let job = if jobs.done.len() < DONE_MAX { jobs.ready.pop_front() } else { None };
+        let job = if jobs.done.len() < self.done_max { jobs.ready.pop_front() } else { None };
         let Some((key, job)) = job else { return (jobs, false) };
         jobs.running += 1;
         drop(jobs);

@@ -109,6 +109,7 @@ impl Terrain {
         if let Reload::Loading(next) = &mut reload {
             next.options.tolerance_pixels = self.options.tolerance_pixels;
             next.options.exaggeration = self.options.exaggeration;
+            next.wires = self.wires;
             next.show_only(self.options.layers.clone());
             let view = next.draw_at(camera, seconds);
             let is_as_exact = view.error_pixels <= self.error_pixels || view.complete || next.is_stuck();

@@ -38,10 +38,7 @@ impl Terrain {
                 state.morphs = Morphs::new(self.options.morph_seconds);
             }
         }
-        let shown = self.layers.iter().filter(|state| state.shown).count().max(1);
-        // The cut takes three quarters: the rest is for what is on its way from one cut to the next.
-        let share = self.options.memory_bytes / shown / 4 * 3;
-        self.layers.iter_mut().for_each(|state| state.memory_bytes = share);
+        self.shares.share_out(&mut self.layers, self.options.gpu_bytes);
         self.options.layers = names;
     }
 

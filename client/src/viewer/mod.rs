@@ -265,6 +265,7 @@ impl Viewer {
             self.controls.stay_above(ground, CLEARANCE_CELLS * self.cell());
         }
         let (reloads, is_replaced) = (self.frame.stats.reloads, self.terrain.scene_changed());
+        self.terrain.set_wires(self.look.wireframe);
         self.frame = self.terrain.frame(self.controls.camera());
         if self.frame.stats.reloads != reloads {
             // Of whatever encoding, its surfaces are the frame's before.

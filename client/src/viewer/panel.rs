@@ -303,13 +303,23 @@ fn figures(viewer: &Viewer, ui: &mut Ui) {
     if stats.texture_tiles > 0 {
         row("imagery", format!("{} tiles, {:.0} MB", stats.texture_tiles, stats.texture_bytes as f64 / 1e6));
     }
-    row("graphics memory", format!("{:.0} MB", viewer.drawn.gpu_bytes as f64 / 1e6));
+    let [surfaces, fixed] = [viewer.drawn.gpu_bytes, viewer.drawn.fixed_bytes].map(|b| b as f64 / 1e6);
+    row("graphics memory", format!("{surfaces:.0} + {fixed:.0} MB"));
+    if stats.traffic.disk_blobs > 0 {
+        row("fetched before", format!("{:.2} MB", stats.traffic.disk_bytes as f64 / 1e6));
+    }
     let history = &viewer.history;
     plot(ui, "ms a frame", &history.milliseconds);
     plot(ui, "error [px]", &history.errors);
     plot(ui, "kB a frame", &history.kilobytes);
-    if let Some(problem) = viewer.terrain.problem() {
-        ui.colored_label(Color32::from_rgb(220, 120, 60), problem);
+    let warning = Color32::from_rgb(220, 120, 60);
+    if let Some(reason) = viewer.terrain.offline() {
+        ui.colored_label(warning, "Offline: what was fetched before.").on_hover_text(reason);
+    } else if let Some(problem) = viewer.terrain.problem() {
+        ui.colored_label(warning, problem);
+    }
+    if frame.limited {
+        ui.colored_label(warning, "There is no memory for less error.");
     }
     if viewer.terrain.scene_changed() {
         ui.colored_label(

@@ -1,0 +1,80 @@
+//! How the memory that a scene is given is shared out.
+//!
+//! | what | of the memory | at most |
+//! |---|---|---|
+//! | surfaces that the cut wants | 3/4 | |
+//! | surfaces, those included | 27/32 | |
+//! | payloads that are wished for or wait for their parents | 1/32 | 16 MiB, some 20 000 typical payloads |
+//! | decoded surfaces that wait for a frame | 1/32 | 256, 25 MB for n = 64 |
+//! | pages of the index beyond those in use | 1/32 | [`PAGES_MAX`] a layer |
+//! | motions | 1/16 | [`MOTIONS_MAX`] a layer |
+
+use super::LayerState;
+use crate::cache::PAGES_MAX;
+use crate::morph::{MOTIONS_MAX, Record};
+use crate::surface::Points;
+use diamantina_protocol::bintree::Forest;
+
+/// Bytes of payloads that are wished for or wait for their parents, however much memory there is.
+const HELD_BYTES_MAX: usize = 16 << 20;
+
+/// Decoded surfaces that wait for a frame to take them, however much memory there is; the decoders pause there.
+const DONE_MAX: usize = 256;
+
+/// The same, however little: a frame must get on.
+const DONE_MIN: usize = 16;
+
+/// What a page of the index takes, about.
+const PAGE_BYTES: usize = 40_000;
+
+/// The least number of pages beyond those in use.
+const PAGES_MIN: usize = 16;
+
+/// The least number of motions.
+const MOTIONS_MIN: usize = 16;
+
+/// The shares of a scene's memory.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Shares {
+    /// All surfaces, in bytes.
+    pub(super) surfaces: usize,
+    /// The surfaces that the layers' cuts want, in bytes.
+    pub(super) cut: usize,
+    /// Payloads on their way, in bytes.
+    pub(super) held: usize,
+    /// Decoded surfaces on their way.
+    pub(super) done: usize,
+    /// Pages of the index of all layers.
+    pages: usize,
+    /// Motions of all layers.
+    motions: usize,
+}
+
+impl Shares {
+    /// Those of so much memory, where a surface takes at most what one of these forests' lattice does.
+    pub(super) fn of(memory_bytes: usize, forests: &[Forest]) -> Self {
+        let bytes = forests.iter().map(|forest| Points::bytes(forest, 0)).max().unwrap_or(1);
+        // A surface has 12 bytes a point.
+        let motion_bytes = bytes / 12 * size_of::<Record>();
+        let part = memory_bytes / 32;
+        Self {
+            surfaces: memory_bytes - 5 * part,
+            cut: memory_bytes / 4 * 3,
+            held: part.min(HELD_BYTES_MAX),
+            done: (part / bytes).clamp(DONE_MIN, DONE_MAX),
+            pages: part / PAGE_BYTES,
+            motions: 2 * part / motion_bytes,
+        }
+    }
+
+    /// Gives each of the layers that are shown its own.
+    pub(super) fn share_out(&self, layers: &mut [LayerState], gpu_bytes: u64) {
+        let shown = layers.iter().filter(|state| state.shown).count().max(1);
+        for state in layers {
+            state.memory_bytes = self.cut / shown;
+            state.gpu_bytes = gpu_bytes / shown as u64;
+            state.pages_max = (self.pages / shown).clamp(PAGES_MIN, PAGES_MAX);
+            state.morphs.set_motions_max((self.motions / shown).clamp(MOTIONS_MIN, MOTIONS_MAX));
+        }
+    }
+}
