@@ -158,7 +158,7 @@ fn the_limit_holds_and_the_finest_of_the_oldest_session_go_first() {
     let shelf = disk.shelf("http://a", None);
     // Of the finest 80 MiB, of the coarser ones 5.
     let (fine, coarse) = (0..4000, 4000..4250);
-    for (i, number) in coarse.clone().chain(fine.clone()).enumerate() {
+    for (i, number) in coarse.clone().chain(fine).enumerate() {
         shelf.put(route("v1", number), if coarse.contains(&number) { 2 } else { 9 }, blob(number, 20 << 10));
         if i % 100 == 99 {
             disk.flush();
