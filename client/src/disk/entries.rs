@@ -293,8 +293,8 @@ impl Entries {
         if !self.is_writable {
             return Ok(());
         }
-        let taken = self.bytes()?;
         let transaction = self.connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
+        let taken = bytes(&transaction)?;
         let names: u64 = round.put.keys().map(|key| ENTRY_BYTES + 2 * key.route.len() as u64).sum();
         // A quarter more: pages are not full.
         let wanted = (round.put_bytes + names) * 5 / 4;
@@ -331,6 +331,18 @@ impl Entries {
             }
         }
         transaction.commit()?;
+        self.empty_log()
+    }
+
+    /// Empties the log where that was not done by itself, since another program was reading.
+    fn empty_log(&self) -> Result<(), Trouble> {
+        let mut log = path(&self.folder, self.number).into_os_string();
+        log.push("-wal");
+        if fs::metadata(log).is_ok_and(|data| data.len() > LOG_BYTES / 2) {
+            let checkpoint = "PRAGMA wal_checkpoint(TRUNCATE)";
+            // Whether another was in the way: then the next round tries again.
+            self.connection.query_row(checkpoint, [], |row| row.get::<_, i64>(0))?;
+        }
         Ok(())
     }
 
