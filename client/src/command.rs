@@ -119,9 +119,9 @@ struct ViewArgs {
     /// The imagery to lay on the terrain, or none [default: the scene's first, if it has any]
     #[arg(long, value_name = "NAME|none")]
     texture: Option<String>,
-    /// Memory for tiles of imagery, and as much again on the GPU
-    #[arg(long, default_value = "128", value_name = "MIB", value_parser = clap::value_parser!(u16).range(4..=1000))]
-    texture_memory: u16,
+    /// Memory for tiles of imagery, at most 1000MiB, and as much again on the GPU; where it is too little, imagery is coarser
+    #[arg(long, default_value = "128MiB", value_name = "SIZE", value_parser = parse_bytes)]
+    texture_memory: u64,
     /// Memory for decoded diamonds; where it is too little for the error asked for, the view is coarser
     #[arg(long, default_value = "1GiB", value_name = "SIZE", value_parser = parse_bytes)]
     memory: u64,
@@ -317,7 +317,7 @@ impl ViewArgs {
                 None if self.look.is_true => Imagery::None,
                 asked => Imagery::asked(asked.clone()),
             },
-            texture_bytes: usize::from(self.texture_memory) << 20,
+            texture_bytes: usize::try_from(self.texture_memory).unwrap_or(usize::MAX),
             fade_seconds: if morph_seconds > 0.0 { FADE_SECONDS.min(morph_seconds) } else { 0.0 },
             ..terrain::Options::default()
         };

@@ -99,8 +99,8 @@ pub struct FrameStats {
     pub uploaded_bytes: u64,
     /// Bytes of GPU memory that surfaces and their motions take: what the budget is about.
     pub gpu_bytes: u64,
-    /// Bytes of GPU memory that the picture's size and the water in view alone decide upon: depth, samples, what is mirrored and seen
-    /// through, and the index lists that all diamonds share.
+    /// Bytes of GPU memory that the picture's size, the water in view and the room for imagery alone decide upon: depth, samples, what is
+    /// mirrored and seen through, tiles, and the index lists that all diamonds share.
     pub fixed_bytes: u64,
 }
 
@@ -325,7 +325,6 @@ impl Renderer {
         let mut stats =
             FrameStats { uploaded_bytes, gpu_bytes: self.residents.bytes(), ..Default::default() };
         stats.uploaded_bytes += std::mem::take(&mut self.draped_bytes);
-        stats.gpu_bytes += self.drapes.bytes();
         if look.wireframe && self.wires.is_none() {
             let made = |mode| terrain_pipelines(&self.device, self.target(), &self.terrain_groups(), mode);
             self.wires = Some([made(Mode::Behind), made(Mode::Lines)]);
@@ -372,7 +371,8 @@ impl Renderer {
             }
             lens.draw_sky(&mut pass, &self.sky, look);
         }
-        stats.fixed_bytes = self.residents.shared_bytes()
+        stats.fixed_bytes = self.drapes.bytes()
+            + self.residents.shared_bytes()
             + attachments.bytes(&self.options)
             + water.as_ref().map_or(0, WaterPasses::bytes);
         (self.lens, self.water, self.attachments) = (Some(lens), water, Some(attachments));
