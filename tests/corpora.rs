@@ -8,8 +8,9 @@ use crate::world::workspace;
 
 type Target = (&'static str, fn(&[u8]));
 
-const TARGETS: [Target; 8] = [
+const TARGETS: [Target; 9] = [
     ("batch_query", targets::batch_query::run),
+    ("coverage", targets::coverage::run),
     ("frames", targets::frames::run),
     ("index_page", targets::index_page::run),
     ("points", targets::points::run),

@@ -2,6 +2,7 @@
 //! `tests/corpora.rs` of the seeds and of some inputs like them, with every run of the tests.
 
 pub mod batch_query;
+pub mod coverage;
 pub mod frames;
 pub mod index_page;
 pub mod points;

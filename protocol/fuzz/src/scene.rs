@@ -1,6 +1,7 @@
 //! Descriptions of scenes: any JSON is a catalogue, a scene or an error, and comes back as it was written.
 
 use diamantina_protocol::message::{Catalogue, Scene};
+use diamantina_protocol::texture::Coverage;
 
 /// One input.
 pub fn run(data: &[u8]) {
@@ -16,5 +17,8 @@ pub fn run(data: &[u8]) {
             let _ = layer.forest.bounds(d);
         }
         let _ = diamantina_protocol::index::pages(&layer.forest);
+    }
+    for texture in scene.textures.iter().filter(|texture| texture.check().is_ok()) {
+        let _ = Coverage::empty(texture).tiles().count();
     }
 }
