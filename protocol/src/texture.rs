@@ -186,6 +186,18 @@ impl Texture {
     }
 }
 
+/// The light of an sRGB value, both from 0 to 1 (IEC 61966-2-1).
+#[must_use]
+pub fn light(srgb: f64) -> f64 {
+    if srgb <= 0.040_45 { srgb / 12.92 } else { ((srgb + 0.055) / 1.055).powf(2.4) }
+}
+
+/// The sRGB value of light, both from 0 to 1: see [`light`].
+#[must_use]
+pub fn srgb(light: f64) -> f64 {
+    if light <= 0.003_130_8 { 12.92 * light } else { 1.055 * light.powf(1.0 / 2.4) - 0.055 }
+}
+
 /// Which tiles of a pyramid are stored.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Coverage {
@@ -316,6 +328,15 @@ mod tests {
             assert_eq!(texture.texel_at(levels - 1), texture.texel);
             assert_eq!(texture.check(), Ok(()));
         }
+    }
+
+    #[test]
+    fn light_and_srgb_are_each_other_s_inverse() {
+        for byte in 0..=255u8 {
+            let value = f64::from(byte) / 255.0;
+            assert!((srgb(light(value)) - value).abs() < 1e-6, "{byte}");
+        }
+        assert!((light(128.0 / 255.0) - 0.215_86).abs() < 1e-4);
     }
 
     #[test]

@@ -4,6 +4,7 @@ use super::{Failure, numbers};
 use clap::{Args, ValueEnum};
 use diamantina_client::render::{self, Background, Colours, Imagery, Look, Shading, Sun, Water};
 use diamantina_protocol::message::Scene;
+use diamantina_protocol::texture;
 use std::ops::RangeInclusive;
 
 /// What heights may be multiplied by.
@@ -238,10 +239,7 @@ fn parse_background(text: &str) -> Result<Background, String> {
     let colour = colour.ok_or("expected sky or six hexadecimal digits, as in ff00ff")?;
     // The picture is sRGB, blending is linear.
     #[allow(clippy::cast_possible_truncation, reason = "a colour needs no more than f32")]
-    let linear = |shift: u32| {
-        let c = f64::from(colour >> shift & 0xff) / 255.0;
-        (if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }) as f32
-    };
+    let linear = |shift: u32| texture::light(f64::from(colour >> shift & 0xff) / 255.0) as f32;
     Ok(Background::Colour([linear(16), linear(8), linear(0), 1.0]))
 }
 

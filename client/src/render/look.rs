@@ -153,6 +153,21 @@ pub enum Colours {
     Flat,
 }
 
+impl Colours {
+    /// All of them, as they are listed to choose from.
+    pub const ALL: [Self; 9] = [
+        Self::Auto,
+        Self::Terrain,
+        Self::Bathymetry,
+        Self::Grey,
+        Self::Batlow,
+        Self::Viridis,
+        Self::Magma,
+        Self::Slope,
+        Self::Flat,
+    ];
+}
+
 /// How terrain is lit. Their numbers are those that the shaders know.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shading {

@@ -8,8 +8,10 @@
 //! CC0). Of each table of 256 colours eight are kept, so placed that no channel in between is more than 9 of 255 off the
 //! table. They change evenly to the eye, and stay apart for people who confuse red and green.
 
+use super::frame::single;
 use super::look::{Colours, Look, Shading};
 use diamantina_protocol::message::Layer;
+use diamantina_protocol::texture;
 
 /// A colour of a ramp: where it stands, and sRGB as 0xRRGGBB.
 pub(super) type Stop = (f32, u32);
@@ -282,33 +284,18 @@ fn byte(channel: f64) -> u8 {
 
 /// The sRGB curve.
 pub(super) fn encoded(linear: f64) -> f64 {
-    if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
+    texture::srgb(linear)
 }
 
 /// Linear red, green and blue of 0xRRGGBB.
 pub(super) fn linear(srgb: u32) -> [f32; 3] {
     let [_, r, g, b] = srgb.to_be_bytes();
-    [r, g, b].map(|byte| {
-        let c = f32::from(byte) / 255.0;
-        if c <= 0.040_45 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
-    })
+    [r, g, b].map(|byte| single(texture::light(f64::from(byte) / 255.0)))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    const ALL: [Colours; 9] = [
-        Colours::Auto,
-        Colours::Terrain,
-        Colours::Bathymetry,
-        Colours::Grey,
-        Colours::Batlow,
-        Colours::Viridis,
-        Colours::Magma,
-        Colours::Slope,
-        Colours::Flat,
-    ];
 
     #[test]
     fn colours_are_linear() {
@@ -336,7 +323,7 @@ mod tests {
 
     #[test]
     fn stops_rise() {
-        for ramp in ALL.map(|colours| &land(colours)[..]).into_iter().chain([&SEA[..]]) {
+        for ramp in Colours::ALL.map(|colours| &land(colours)[..]).into_iter().chain([&SEA[..]]) {
             assert!(ramp.is_sorted_by(|a, b| a.0 < b.0));
             assert_eq!((ramp[0].0, ramp[ramp.len() - 1].0), (0.0, 1.0));
         }
@@ -365,7 +352,7 @@ mod tests {
     /// What a reader of a picture does: the value whose colour is nearest.
     #[test]
     fn a_colour_tells_its_value() {
-        for colours in ALL {
+        for colours in Colours::ALL {
             for heights in [[-2153.0, 1599.0], [0.0, 4128.0], [12.0, 146.0]] {
                 let look = Look { colours, ..Look::default() };
                 let scale = Scale::over(&look, heights);

@@ -5,8 +5,8 @@
 
 use crate::background::Background;
 use bytes::Bytes;
-use diamantina_protocol::texture::{SIDE, Tile};
-use std::sync::{OnceLock, mpsc};
+use diamantina_protocol::texture::{self, SIDE, Tile};
+use std::sync::mpsc;
 
 /// The texels of a tile: red, green, blue and opacity, rows from the north, sRGB; colours are multiplied by the opacity, as
 /// light, so that the texels' mean is that of what they show.
@@ -45,18 +45,10 @@ fn multiply(texel: &mut [u8; 4]) {
         *texel = [0; 4];
         return;
     }
-    static LIGHT: OnceLock<[f32; 256]> = OnceLock::new();
-    let light = LIGHT.get_or_init(|| {
-        std::array::from_fn(|srgb| {
-            let value = srgb as f32 / 255.0;
-            if value <= 0.040_45 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
-        })
-    });
     for colour in &mut texel[..3] {
-        let less = light[usize::from(*colour)] * f32::from(opacity) / 255.0;
-        let encoded = if less <= 0.003_130_8 { 12.92 * less } else { 1.055 * less.powf(1.0 / 2.4) - 0.055 };
+        let less = texture::light(f64::from(*colour) / 255.0) * f64::from(opacity) / 255.0;
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "from 0 to 255")]
-        let byte = (encoded * 255.0).round() as u8;
+        let byte = (texture::srgb(less) * 255.0).round() as u8;
         *colour = byte;
     }
 }

@@ -11,18 +11,6 @@ use std::collections::VecDeque;
 /// Frames that the plots show.
 const HISTORY: usize = 240;
 
-const COLOURS: [Colours; 9] = [
-    Colours::Auto,
-    Colours::Terrain,
-    Colours::Bathymetry,
-    Colours::Grey,
-    Colours::Batlow,
-    Colours::Viridis,
-    Colours::Magma,
-    Colours::Slope,
-    Colours::Flat,
-];
-
 /// What has been seen frame by frame.
 #[derive(Debug, Default)]
 pub(super) struct History {
@@ -148,7 +136,7 @@ fn view(viewer: &mut Viewer, ui: &mut Ui) {
         Colours::Flat => "none: light alone",
     };
     ComboBox::from_label("colours").selected_text(name(viewer.look.colours)).show_ui(ui, |ui| {
-        for colours in COLOURS {
+        for colours in Colours::ALL {
             ui.selectable_value(&mut viewer.look.colours, colours, name(colours));
         }
     });

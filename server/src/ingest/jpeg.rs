@@ -12,7 +12,7 @@ use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
 use super::error::{Result, broken, io_error, unsupported};
-use super::raster::{Dtype, Picture, Raster, Samples};
+use super::raster::{Dtype, Picture, Raster};
 use super::samples::{Order, SampleFile};
 use super::world_file;
 
@@ -51,18 +51,6 @@ pub(super) fn open(path: &Path, mut file: File) -> Result<Raster> {
     let order = Order::RowsFromNorth;
     let samples = SampleFile { file, dtype, big_endian: false, order, width, height, bands: colours };
     samples.check_length(path)?;
-    Ok(Raster {
-        file: path.to_owned(),
-        width,
-        height,
-        place: world_file::find(path, height)?,
-        dtype,
-        integer: true,
-        height_scale: 1.0,
-        height_offset: 0.0,
-        height_doubt: None,
-        nodata: None,
-        picture: Some(Picture { colours, opacity: None }),
-        samples: Samples::File(samples),
-    })
+    let picture = Picture { colours, opacity: None };
+    Ok(Raster::plain(path, samples, world_file::find(path, height)?, Some(picture)))
 }

@@ -54,7 +54,7 @@ use error::{Result, broken, io_error, options as bad_options, unsupported};
 use geotiff::ChunkCache;
 use mosaic::Mosaic;
 use over::Base;
-use raster::{Dtype, Place, Raster, SIDE_MAX, Samples, SourceCrs, Wanted, Window};
+use raster::{Dtype, Place, Raster, SIDE_MAX, SourceCrs, Wanted, Window};
 use reproject::Reprojection;
 use samples::{Order, SampleFile};
 
@@ -484,20 +484,7 @@ fn open_raw(path: &Path, file: File, shape: RawShape) -> Result<Raster> {
     let samples =
         SampleFile { file, dtype, big_endian: false, order: Order::RowsFromNorth, width, height, bands: 1 };
     samples.check_length(path)?;
-    Ok(Raster {
-        file: path.to_owned(),
-        width,
-        height,
-        place: None,
-        dtype,
-        integer: dtype.is_integer(),
-        height_scale: 1.0,
-        height_offset: 0.0,
-        height_doubt: None,
-        nodata: None,
-        picture: None,
-        samples: Samples::File(samples),
-    })
+    Ok(Raster::plain(path, samples, None, None))
 }
 
 /// Applies what the command line says of values.

@@ -10,7 +10,7 @@ use std::path::Path;
 use ::png::{BitDepth, ColorType, Decoder, Limits, Transformations};
 
 use super::error::{Result, broken, io_error, unsupported};
-use super::raster::{Dtype, Picture, Raster, SIDE_MAX, Samples, Wanted};
+use super::raster::{Dtype, Picture, Raster, SIDE_MAX, Wanted};
 use super::samples::{Order, SampleFile};
 use super::world_file;
 
@@ -82,18 +82,5 @@ pub(super) fn open(path: &Path, file: File, wanted: Wanted) -> Result<Raster> {
     let samples =
         SampleFile { file, dtype, big_endian: true, order: Order::RowsFromNorth, width, height, bands };
     samples.check_length(path)?;
-    Ok(Raster {
-        file: path.to_owned(),
-        width,
-        height,
-        place: world_file::find(path, height)?,
-        dtype,
-        integer: true,
-        height_scale: 1.0,
-        height_offset: 0.0,
-        height_doubt: None,
-        nodata: None,
-        picture,
-        samples: Samples::File(samples),
-    })
+    Ok(Raster::plain(path, samples, world_file::find(path, height)?, picture))
 }

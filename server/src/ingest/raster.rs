@@ -1,6 +1,6 @@
 //! One opened DEM file: where its samples lie, what they mean, and windows of them.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use super::error::Result;
 use super::geotiff::Chunks;
@@ -181,6 +181,29 @@ pub(super) const OPACITY: u32 = 3;
 const OPAQUE: f64 = 255.0;
 
 impl Raster {
+    /// A file of plain values: metres of height, or the bands of a picture.
+    pub(super) fn plain(
+        file: &Path,
+        samples: SampleFile,
+        place: Option<Place>,
+        picture: Option<Picture>,
+    ) -> Self {
+        Self {
+            file: file.to_owned(),
+            width: samples.width,
+            height: samples.height,
+            place,
+            dtype: samples.dtype,
+            integer: samples.dtype.is_integer(),
+            height_scale: 1.0,
+            height_offset: 0.0,
+            height_doubt: None,
+            nodata: None,
+            picture,
+            samples: Samples::File(samples),
+        }
+    }
+
     /// Fills `out` (as long as the window, rows from the south) with values, NaN for nodata. `band` is for pictures.
     pub(super) fn read(&self, window: Window, band: u32, out: &mut [f64]) -> Result<()> {
         debug_assert_eq!(out.len(), window.samples());

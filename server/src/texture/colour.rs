@@ -3,6 +3,8 @@
 //! sRGB numbers are about square roots of light (IEC 61966-2-1): their mean is darker than what one sees of the same
 //! texels from farther away, and fine patterns would darken from level to level.
 
+use diamantina_protocol::texture;
+
 /// Steps of the table that leads back to sRGB: at the dark end, where it is steepest, a step is 0.8 of a number.
 const STEPS: usize = 4096;
 
@@ -12,22 +14,13 @@ pub(super) struct Averages {
     srgb: Vec<u8>,
 }
 
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "from 0 to 255")]
-fn encoded(light: f64) -> u8 {
-    let value = if light <= 0.003_130_8 { 12.92 * light } else { 1.055 * light.powf(1.0 / 2.4) - 0.055 };
-    (value * 255.0).round() as u8
-}
-
-#[expect(clippy::cast_possible_truncation, reason = "24 bits are enough for 8")]
-fn linear(srgb: u8) -> f32 {
-    let value = f64::from(srgb) / 255.0;
-    (if value <= 0.040_45 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }) as f32
-}
-
 impl Averages {
     pub(super) fn new() -> Self {
-        let light = std::array::from_fn(|srgb| linear(u8::try_from(srgb).unwrap_or(u8::MAX)));
-        let srgb = (0..=STEPS).map(|step| encoded(step as f64 / STEPS as f64)).collect();
+        #[expect(clippy::cast_possible_truncation, reason = "24 bits are enough for 8")]
+        let light = std::array::from_fn(|srgb| texture::light(srgb as f64 / 255.0) as f32);
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "from 0 to 255")]
+        let encoded = |step: usize| (texture::srgb(step as f64 / STEPS as f64) * 255.0).round() as u8;
+        let srgb = (0..=STEPS).map(encoded).collect();
         Self { light, srgb }
     }
 
