@@ -520,7 +520,7 @@ fn layers_that_make_no_scene_are_refused_with_what_to_do() {
     let sea = "--layer sea=water:{}/sea.asc";
     for (args, code, expected) in [
         ("{}/dem.tif --layer sea", 2, &["NAME=KIND:PATH"][..]),
-        ("{}/dem.tif --layer sea=texture:{}/sea.asc", 2, &["not built yet"]),
+        ("{}/dem.tif --layer sea=texture:{}/sea.asc", 1, &["sea.asc", "GeoTIFF, PNG or JPEG"]),
         ("{}/dem.tif --layer Sea=water:{}/sea.asc", 2, &["small letters", "'Sea'"]),
         ("{}/dem.tif --layer terrain=water:{}/sea.asc", 2, &["'terrain' is terrain", "another name"]),
         ("{}/dem.tif --layer sea=water:{}/sea.asc --layer sea=water:level=0", 2, &["'sea'", "level"]),

@@ -523,7 +523,7 @@ fn the_contract_tells_every_answer_that_is_given() {
     let contract: serde_json::Value = serde_json::from_slice(&answer.body).unwrap();
     assert_eq!((&contract["openapi"], answer.header("content-type")), (&"3.1.0".into(), "application/json"));
     let paths = contract["paths"].as_object().unwrap();
-    assert_eq!(paths.len(), 17);
+    assert_eq!(paths.len(), 18);
     let good = |name: &str| match name {
         "scene" => "world".to_owned(),
         "version" => version.clone(),
@@ -563,8 +563,10 @@ fn the_contract_tells_every_answer_that_is_given() {
             }
         }
     }
-    // Each route was seen to answer (this scene has neither triangles nor a zone), and all kinds of refusals.
-    for template in paths.keys().filter(|t| !t.contains("tin") && !t.contains("zone")) {
+    // Each route was seen to answer (this scene has neither triangles nor a zone nor imagery), and all kinds of refusals.
+    for template in
+        paths.keys().filter(|t| !["tin", "zone", "texture"].iter().any(|lacking| t.contains(lacking)))
+    {
         assert!(seen.contains(&(template.clone(), "200".to_owned())), "{template}: {seen:?}");
     }
     for status in ["400", "404", "405", "410", "413"] {

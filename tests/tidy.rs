@@ -223,7 +223,10 @@ fn every_module_imports_only_what_the_table_allows() {
         let src = workspace().join(name).join("src");
         for file in sources(&src, &[".rs"]) {
             let here = module(&src, &file);
-            let is_test = file.file_name().is_some_and(|n| n == "tests.rs");
+            let is_test = file.file_name().is_some_and(|n| n == "tests.rs")
+                || file
+                    .strip_prefix(&src)
+                    .is_ok_and(|inside| inside.components().any(|c| c.as_os_str() == "tests"));
             if is_test || matches!(here.as_str(), "lib" | "main" | "bin") {
                 continue;
             }
