@@ -2,7 +2,7 @@
 //! for servers, and the same command completes it to the last byte, with nothing left beside it.
 
 use crate::determinism::files;
-use crate::hostile::{PATIENCE, end, server, signal, start, words};
+use crate::hostile::{PATIENCE, end, server, start, words};
 use crate::limits::connect;
 use crate::swap::publish;
 use crate::world::{Dice, programs, serve_within};
@@ -176,7 +176,8 @@ fn killed_at_any_of_fifty_moments_a_build_shows_no_half_of_a_scene_and_is_comple
                     whole.mul_f64((f64::from(moment) + dice.roll()) / f64::from(MOMENTS))
                 };
                 sleep(after);
-                signal(&child, "KILL");
+                // It may have ended by itself, and been waited for.
+                child.kill().unwrap();
                 let was_killed = end(child).code.is_none();
                 let what = format!("seed {SEED}, moment {moment}, after {after:?}");
                 let left = read(store, &[&old, &new], &what);
