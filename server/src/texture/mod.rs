@@ -1,7 +1,7 @@
 //! Builds the pyramid of a texture: imagery → tiles → store.
 //!
 //! The finest level is read from the imagery, a row of a few tiles at a time; while its tiles are encoded, its texels are
-//! averaged two by two into a [`Plane`] on disk, from which the next level is made in the same way. So each pixel of the
+//! averaged two by two into a plane on disk, from which the next level is made in the same way. So each pixel of the
 //! source is read once (those under gutters twice), memory is a few rows of tiles a thread, and the disk holds a third
 //! of the image's texels, 4 bytes each.
 //!
