@@ -220,11 +220,14 @@ fn picture(path: &Path, header: &Header<'_>, layout: Layout, compression: u64) -
     let bits = header.integers(258, u64::from(BANDS_MAX))?;
     let formats = header.integers(339, u64::from(BANDS_MAX))?;
     let is_bytes = bits.iter().all(|bits| *bits == 8) && !bits.is_empty() && formats.iter().all(|f| *f == 1);
-    let colours = match photometric {
-        1 => Some(1),
-        2 => Some(3),
-        6 if compression == JPEG => Some(3),
-        _ => None,
+    // How many bands the file itself takes for colours: the others are extra.
+    let (named, colours) = match photometric {
+        // Without names for its bands, as many programs write it.
+        1 if layout.bands >= 3 => (1, Some(3)),
+        1 => (1, Some(1)),
+        2 => (3, Some(3)),
+        6 if compression == JPEG => (3, Some(3)),
+        _ => (0, None),
     };
     let Some(colours) = colours.filter(|colours| is_bytes && *colours <= layout.bands) else {
         let found =
@@ -243,7 +246,8 @@ fn picture(path: &Path, header: &Header<'_>, layout: Layout, compression: u64) -
     };
     // Of the bands beyond the colours, those marked as opacity: 1 is multiplied into the colours, 2 is not.
     let extra = header.integers(338, u64::from(BANDS_MAX))?;
-    let opacity = (colours..layout.bands).zip(&extra).find(|(_, kind)| matches!(kind, 1 | 2));
+    let mut extra = (named..layout.bands).zip(&extra);
+    let opacity = extra.find(|(band, kind)| *band >= colours && matches!(kind, 1 | 2));
     Ok(Picture { colours, opacity: opacity.map(|(band, _)| band) })
 }
 

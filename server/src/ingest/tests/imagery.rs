@@ -54,6 +54,9 @@ fn tiffs_of_tiles_of_jpeg_and_of_a_plane_for_each_band_are_read() {
     let first = ground(&folder);
     let jpeg = put(&folder, "jpeg.tif", include_bytes!("quarters_jpeg.tif"));
     check(&Imagery::open(&[jpeg], &Options::default(), &first).unwrap(), 4, |_, _| false);
+    // Three bands that nobody calls red, green and blue.
+    let unnamed = put(&folder, "unnamed.tif", include_bytes!("quarters_unnamed.tif"));
+    check(&Imagery::open(&[unnamed], &Options::default(), &first).unwrap(), 0, |_, _| false);
     // 16 x 8 pixels of its north-west corner are the value that it declares as none.
     let planar = put(&folder, "planar.tif", include_bytes!("quarters_planar.tif"));
     check(&Imagery::open(&[planar], &Options::default(), &first).unwrap(), 0, |x, y| x < 16 && y >= 40);
