@@ -13,7 +13,7 @@ const PROTOCOL: &[(&str, &[&str])] = &[
     ("points", &["bintree", "bitree", "diamond", "rans"]),
     ("tin", &["bintree", "bitree", "diamond", "rans"]),
     ("index", &["bintree", "diamond", "wire"]),
-    ("projection", &[]),
+    ("projection", &["message"]),
     ("sight", &["bintree"]),
     ("texture", &[]),
     ("message", &["bintree", "diamond", "points", "texture", "wire", "zone"]),

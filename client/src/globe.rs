@@ -3,7 +3,7 @@
 //! A frame is a plane, and its y axis is north in its middle at best; its metres are those of a map projection, which in
 //! Mercator's are half as long at 60 degrees. What is told of pictures counts on the ground.
 
-use diamantina_protocol::message::Frame;
+use diamantina_protocol::message::{Crs, Frame};
 use diamantina_protocol::projection::{Projection, ellipsoid};
 use glam::{DVec2, DVec3};
 
@@ -20,8 +20,8 @@ const STEP_DEGREES: f64 = 1e-3;
 #[derive(Debug)]
 pub struct Globe {
     projection: Projection,
-    origin: [f64; 2],
-    per_metre: [f64; 2],
+    /// How the frame lies in its system.
+    crs: Crs,
     /// Half axes of the ellipsoid, in metres.
     axes: [f64; 2],
 }
@@ -36,16 +36,13 @@ impl Globe {
         let (a, b) = ellipsoid(proj4);
         // Longitudes and latitudes of the Earth are those of WGS 84, whatever sphere a map is drawn from.
         let axes = if (a - EARTH[0]).abs() < 20_000.0 { EARTH } else { [a, b] };
-        Some(Self { projection, origin: crs.origin, per_metre: crs.per_metre, axes })
+        Some(Self { projection, crs: crs.clone(), axes })
     }
 
     /// Longitude, from -180 to 180, and latitude in degrees of a place in the frame's metres.
     #[must_use]
     pub fn lonlat(&self, place: DVec3) -> Option<[f64; 2]> {
-        let [x, y] = [0, 1].map(|i| self.origin[i] + place[i] * self.per_metre[i]);
-        let (lon, lat) = self.projection.inverse(x, y)?;
-        let lon = if (-180.0..=180.0).contains(&lon) { lon } else { (lon + 180.0).rem_euclid(360.0) - 180.0 };
-        Some([lon, lat])
+        self.projection.lonlat(&self.crs, [place.x, place.y])
     }
 
     /// The direction to the north pole at a place: a unit vector of the frame. `None` where there is none, as at the pole.
@@ -56,7 +53,7 @@ impl Globe {
         let step = if lat + STEP_DEGREES > 90.0 { -STEP_DEGREES } else { STEP_DEGREES };
         let (x, y) = self.projection.forward(lon, lat + step)?;
         let there = [x, y];
-        let along = [0, 1].map(|i| (there[i] - self.origin[i]) / self.per_metre[i] - place[i]);
+        let along = [0, 1].map(|i| (there[i] - self.crs.origin[i]) / self.crs.per_metre[i] - place[i]);
         (DVec2::from(along) * step.signum()).try_normalize()
     }
 
@@ -83,7 +80,6 @@ impl Globe {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use diamantina_protocol::message::Crs;
 
     fn globe(proj4: &str, origin: [f64; 2], per_metre: f64) -> Option<Globe> {
         let crs = Crs { name: "made".into(), proj4: Some(proj4.into()), origin, per_metre: [per_metre; 2] };

@@ -5,6 +5,7 @@
 //! proj4rs's ellipsoids (see `REWRITTEN`). No shift grids are carried: NAD27 gets its mean shift (good to
 //! some 10 m), the grids of other datums are left out.
 
+use crate::message::Crs;
 use proj4rs::Proj;
 use proj4rs::transform::transform;
 
@@ -105,6 +106,16 @@ impl Projection {
             Kind::Proj(proj) => convert(proj, &self.lonlat, x, y),
             Kind::Equirectangular(eqc) => eqc.inverse(x, y),
         }
+    }
+
+    /// Longitude, from -180 to 180, and latitude in degrees of a place in the metres of a frame that lies so in this system;
+    /// `None` where there are none.
+    #[must_use]
+    pub fn lonlat(&self, frame: &Crs, place: [f64; 2]) -> Option<[f64; 2]> {
+        let [x, y] = [0, 1].map(|i| frame.origin[i] + place[i] * frame.per_metre[i]);
+        let (lon, lat) = self.inverse(x, y)?;
+        let lon = if (-180.0..=180.0).contains(&lon) { lon } else { (lon + 180.0).rem_euclid(360.0) - 180.0 };
+        Some([lon, lat])
     }
 
     /// Coordinates in `other` of the point (x, y) of this CRS, the datum shifted once, directly.

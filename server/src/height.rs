@@ -80,16 +80,6 @@ pub fn to_frame(crs: Option<&Crs>, lon: f64, lat: f64) -> Result<[f64; 2], Heigh
     Ok([(x - crs.origin[0]) / crs.per_metre[0], (y - crs.origin[1]) / crs.per_metre[1]])
 }
 
-/// Longitude and latitude, in degrees, of frame coordinates, where there is a projection.
-#[must_use]
-pub fn to_lonlat(crs: Option<&Crs>, [x, y]: [f64; 2]) -> Option<(f64, f64)> {
-    let (projection, crs) = projection(crs).ok()?;
-    let (lon, lat) =
-        projection.inverse(crs.origin[0] + x * crs.per_metre[0], crs.origin[1] + y * crs.per_metre[1])?;
-    let beyond = !(-180.0..=180.0).contains(&lon);
-    Some((if beyond { (lon + 180.0).rem_euclid(360.0) - 180.0 } else { lon }, lat))
-}
-
 /// The height of a layer at frame coordinates `[x, y]`, on the finest surface: the plane of the bintree
 /// triangle there. Decodes some tens of diamonds: milliseconds.
 ///
@@ -143,13 +133,13 @@ pub fn height(
     } else {
         return Err(HeightError::Damaged(format!("no diamond at {centroid:?}")));
     }
-    let lonlat = to_lonlat(crs, [x, y]);
+    let lonlat = projection(crs).ok().and_then(|(projection, crs)| projection.lonlat(crs, [x, y]));
     let metres = height.map(|h| h * layer.quantum + layer.height_offset);
     Ok(HeightAnswer {
         x,
         y,
-        lon: lonlat.map(|l| l.0),
-        lat: lonlat.map(|l| l.1),
+        lon: lonlat.map(|[lon, _]| lon),
+        lat: lonlat.map(|[_, lat]| lat),
         height: metres,
         error: f64::from(layer.finest_error),
         nodata: metres.is_none(),
