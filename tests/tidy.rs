@@ -42,6 +42,7 @@ const SERVER: &[(&str, &[&str])] = &[
     ("settings", &["http", "size"]),
     // What the program is told of layers, and what it prints.
     ("layer_args", &[]),
+    ("arguments", &["layer_args"]),
     ("print", &["layer_args"]),
     ("sample", &[]),
     ("client_program", &[]),

@@ -1,9 +1,14 @@
 //! The command line of the server.
 
+mod arguments;
 mod layer_args;
 mod print;
 
-use clap::{ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
+use arguments::{
+    BuildArgs, Cli, Command, ConfigCommand, DemoArgs, Encoding, ExperimentArgs, InspectArgs, MetricName,
+    PublishArgs, RepairArgs, RuleName, ZoneArgs,
+};
+use clap::{ArgMatches, CommandFactory, FromArgMatches};
 use diamantina_protocol::message::is_name;
 use diamantina_protocol::points::Rule;
 use diamantina_server::experiment::ExperimentError;
@@ -12,311 +17,17 @@ use diamantina_server::ingest::IngestError;
 use diamantina_server::inspect;
 use diamantina_server::progress::Progress;
 use diamantina_server::settings::{self, LogFormat, Merged, Settings};
-use diamantina_server::size::parse_bytes;
 use diamantina_server::store::{Disk, Published, Publisher, Shared, Store, StoreError, is_address, repair};
 use diamantina_server::tin::Metric;
-use diamantina_server::zone::polygon::Coordinates;
 use diamantina_server::zone::{self, ZoneError};
-use diamantina_server::{curve, demo, experiment, http, ingest, texture};
-use layer_args::{LayerArg, Layers};
+use diamantina_server::{curve, demo, experiment, http, texture};
+use layer_args::Layers;
 use std::io::{IsTerminal, Write};
-use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::signal::unix::{SignalKind, signal};
-
-/// Builds and serves streamed terrain.
-#[derive(Parser)]
-#[command(version, about, propagate_version = true)]
-struct Cli {
-    #[command(subcommand)]
-    command: Command,
-}
-
-#[derive(Subcommand)]
-enum Command {
-    /// Turn DEM files into a store of diamonds
-    Build(Box<BuildArgs>),
-    /// Offer stores over HTTP
-    Serve(Box<ServeArgs>),
-    /// Look at what `serve` is told by a file, the environment and flags
-    #[command(subcommand)]
-    Config(ConfigCommand),
-    /// Make a token for a private scene, and the line for the file of `serve --tokens`
-    Token(TokenArgs),
-    /// Put a built store into an object store, or what of it is not there yet
-    Publish(PublishArgs),
-    /// Say what a store holds
-    Inspect(InspectArgs),
-    /// Check every blob of a store, and mend what is damaged from another copy
-    Repair(RepairArgs),
-    /// Compute what is seen from a region where the viewer stays, and add it to a store
-    Zone(Box<ZoneArgs>),
-    /// Build a sample scene, serve it and render a picture of it
-    Demo(DemoArgs),
-    /// Compare ways to select and transmit points: tables, plots and a report
-    Experiment(Box<ExperimentArgs>),
-    /// Ask a running server whether it is well (for container health checks)
-    Health(HealthArgs),
-}
-
-#[derive(Args)]
-struct BuildArgs {
-    /// DEM files of the layer "terrain": GeoTIFF, .hgt, Arc ASCII, USGS DEM or PNG, also in a .gz, or alone in a .zip;
-    /// raw, also in a .gz
-    #[arg(required_unless_present = "layers", value_name = "DEM")]
-    sources: Vec<PathBuf>,
-    /// Another layer: NAME=terrain:DEM or NAME=water:DEM (there is water where the file has heights), or flat water over
-    /// the first terrain: NAME=water:level=METRES; or imagery draped on the terrain, NAME=texture:PICTURE, as GeoTIFF, PNG
-    /// or JPEG with a world file. Said again with the same name it adds a file. The first layer decides
-    /// the frame, to which others are resampled; what is said of files holds for those of all layers
-    #[arg(long = "layer", id = "layers", value_name = "NAME=KIND:FILE")]
-    layers: Vec<LayerArg>,
-    /// The folder of the store, or the address of an object store (s3://BUCKET/PREFIX, gs://..., az://...); an older
-    /// scene there is replaced once the new one is complete
-    #[arg(short, long, value_name = "STORE")]
-    output: PathBuf,
-    /// Where the store is built before it is sent to an object store; then it stays there [default: NAME.upload here,
-    /// which goes once all is sent]
-    #[arg(long, value_name = "FOLDER")]
-    work: Option<PathBuf>,
-    /// The largest error at the finest level, in metres; 0 is lossless (floats: to the quantum)
-    #[arg(long, default_value_t = 0.0, value_name = "METRES", allow_negative_numbers = true)]
-    max_error: f64,
-    /// The most memory to use
-    #[arg(long, default_value = "2GiB", value_name = "BYTES", value_parser = parse_bytes)]
-    memory: u64,
-    /// Threads [default: one a core]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
-    threads: Option<u16>,
-    /// Encodings to build
-    #[arg(long, default_value = "points", value_enum, value_delimiter = ',')]
-    encoding: Vec<Encoding>,
-    /// tin: triangles of a patch at which simplification stops, but for the finest: these keep --max-error
-    #[arg(long, default_value_t = hierarchy::PATCH_TRIANGLES, value_name = "N")]
-    patch_triangles: u32,
-    /// tin: the order of collapses
-    #[arg(long, default_value = "normal", value_enum)]
-    metric: MetricName,
-    /// tin: how much borders along nodata count in that order
-    #[arg(long, default_value_t = hierarchy::LAMBDA, value_name = "WEIGHT", allow_negative_numbers = true)]
-    lambda: f64,
-    /// tin: stop at this error instead of a count, in metres: of the finest patches that are simplified, twice as much
-    /// every two levels
-    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
-    patch_error: Option<f64>,
-    /// How the receiver deduces the height of a fictitious point
-    #[arg(long, default_value = "smooth", value_enum)]
-    rule: RuleName,
-    /// Metres of the unit in which heights are stored [default: the source's own unit, or found from it]
-    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
-    quantum: Option<f64>,
-    /// How well textures keep their pictures: 1 to 99, as of JPEG; 100: exactly
-    #[arg(long, default_value_t = texture::QUALITY, value_name = "N")]
-    texture_quality: u8,
-    /// Segments along each side of a patch
-    #[arg(long, default_value = "64", value_name = "N", value_parser = ["32", "64", "128"])]
-    patch_segments: String,
-    /// The scene's name in addresses [default: the name of the store's folder]
-    #[arg(long, value_name = "NAME")]
-    scene: Option<String>,
-    #[command(flatten)]
-    ingest: ingest::Options,
-    /// Begin anew even where an interrupted build of the same could be gone on with
-    #[arg(long)]
-    fresh: bool,
-    /// Seconds between checkpoints: the most work that a kill costs
-    #[arg(long, default_value_t = hierarchy::CHECKPOINT.as_secs(), value_name = "SECONDS")]
-    checkpoint: u64,
-    /// Only estimate, from a sample of the source, what a build of points would take and give; nothing is written
-    #[arg(long)]
-    dry_run: bool,
-    /// Print the report as JSON
-    #[arg(long)]
-    json: bool,
-}
-
-#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Encoding {
-    /// Progressive points: the fewest bytes
-    Points,
-    /// Irregular triangles: the fewest triangles
-    Tin,
-}
-
-#[derive(Clone, Copy, ValueEnum)]
-enum MetricName {
-    /// How much normals change
-    Normal,
-    /// Squared distances to planes
-    Quadric,
-}
-
-#[derive(Clone, Copy, ValueEnum)]
-enum RuleName {
-    Midpoint,
-    Smooth,
-}
-
-#[derive(Args)]
-struct ServeArgs {
-    /// Settings as TOML, `max_connections = 10` for --max-connections 10; flags win, then variables such as
-    /// DIAMANTINA_MAX_CONNECTIONS [also: DIAMANTINA_CONFIG]
-    #[arg(long, value_name = "FILE")]
-    config: Option<PathBuf>,
-    #[command(flatten)]
-    settings: Settings,
-}
-
-#[derive(Subcommand)]
-enum ConfigCommand {
-    /// Try all that `serve` would do with a file of settings, but for listening and the disk cache
-    Check(Box<ServeArgs>),
-    /// Print all settings as a file, and where each is from
-    Print(Box<ServeArgs>),
-}
-
-#[derive(Args)]
-struct TokenArgs {
-    /// The scene's name
-    scene: String,
-}
-
-#[derive(Args)]
-struct PublishArgs {
-    /// The folder of the store
-    store: PathBuf,
-    /// Where to: s3://BUCKET/PREFIX, gs://..., az://...
-    address: PathBuf,
-    /// Then remove all versions there but this one and the one before
-    #[arg(long)]
-    prune: bool,
-}
-
-#[derive(Args)]
-struct InspectArgs {
-    /// The folder of the store, or the address of an object store
-    store: PathBuf,
-    /// Print JSON
-    #[arg(long)]
-    json: bool,
-    /// Read, check and decode every blob
-    #[arg(long)]
-    verify: bool,
-    /// Write, for each prefix of each layer's progressive stream, its bytes and its declared and true errors
-    /// here (- for standard output, and nothing else)
-    #[arg(long, value_name = "CSV")]
-    curve: Option<PathBuf>,
-}
-
-#[derive(Args)]
-struct RepairArgs {
-    /// The folder of the store, or the address of an object store
-    store: PathBuf,
-    /// A copy of the same version: a folder, the address of an object store, or http://HOST:PORT of a server [default:
-    /// nothing is mended, only told]
-    #[arg(long, value_name = "COPY")]
-    from: Option<PathBuf>,
-}
-
-#[derive(Args)]
-struct ZoneArgs {
-    /// The folder of the store
-    store: PathBuf,
-    /// The zone's name in addresses
-    #[arg(long, value_name = "NAME")]
-    name: String,
-    /// The region, as GeoJSON: a Polygon or MultiPolygon, alone or in features. Ground that slopes is better cut
-    /// into several polygons: each has its own ceiling
-    #[arg(long, value_name = "GEOJSON", required_unless_present = "remove")]
-    polygon: Option<PathBuf>,
-    /// What the polygon's numbers mean
-    #[arg(long, default_value = "auto", value_enum)]
-    coordinates: Coordinates,
-    /// How far above the highest ground of each polygon the eye may be
-    #[arg(long, value_name = "METRES", required_unless_present = "remove", allow_negative_numbers = true)]
-    eye: Option<f64>,
-    /// The least height of the ground in the polygons, where the scene has none, as of water
-    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
-    level: Option<f64>,
-    /// What the errors of hidden ground count for: 0 to below 1
-    #[arg(long, default_value_t = zone::HIDDEN, value_name = "SHARE", allow_negative_numbers = true)]
-    hidden: f64,
-    /// The angle of a pixel: errors grow no larger than what hides them allows. 0: all that is hidden counts for
-    /// --hidden, however little it is hidden
-    #[arg(long, default_value_t = zone::ANGLE, value_name = "RADIANS", allow_negative_numbers = true)]
-    angle: f64,
-    /// The least apparent width of a triangle that a ray must not miss
-    #[arg(long, default_value_t = zone::EPSILON, value_name = "RADIANS", allow_negative_numbers = true)]
-    epsilon: f64,
-    /// Between eyes along the contour [default: 4 cells, or more for 200 eyes at most]
-    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
-    spacing: Option<f64>,
-    /// Let the Earth's curvature hide what is far (with refraction, coefficient 0.13). The client draws a plane:
-    /// there, what lies behind the horizon is seen
-    #[arg(long)]
-    curvature: bool,
-    /// Replace a zone of this name
-    #[arg(long)]
-    replace: bool,
-    /// Remove the zone instead
-    #[arg(long, conflicts_with_all = ["polygon", "eye", "replace"])]
-    remove: bool,
-    /// The most memory to use
-    #[arg(long, default_value = "2GiB", value_name = "BYTES", value_parser = parse_bytes)]
-    memory: u64,
-    /// Threads [default: one a core]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
-    threads: Option<u16>,
-    /// Print the report as JSON
-    #[arg(long)]
-    json: bool,
-}
-
-#[derive(Args)]
-struct DemoArgs {
-    /// The folder for the sample DEM, its store and the picture
-    #[arg(long, default_value = "demo", value_name = "FOLDER")]
-    folder: PathBuf,
-    /// Samples along each side of the sample DEM
-    #[arg(long, default_value_t = 2049, value_name = "N", value_parser = clap::value_parser!(u32).range(257..=16385))]
-    samples: u32,
-    /// The address to listen on
-    #[arg(long, default_value = "127.0.0.1:8080", value_name = "ADDRESS:PORT")]
-    listen: SocketAddr,
-    /// End after the picture [also: HEADLESS=1]
-    #[arg(long)]
-    headless: bool,
-}
-
-#[derive(Args)]
-struct ExperimentArgs {
-    /// Which
-    #[arg(value_name = "NAME", value_parser = experiment::ALL.iter().map(|e| e.name).collect::<Vec<_>>())]
-    name: String,
-    /// DEM files, each by itself, in any format that `build` reads
-    #[arg(required = true, value_name = "DEM")]
-    sources: Vec<PathBuf>,
-    /// The folder for the tables (CSV), the pictures and report.html
-    #[arg(short, long, value_name = "FOLDER")]
-    output: PathBuf,
-    #[command(flatten)]
-    options: experiment::Options,
-    #[command(flatten)]
-    ingest: ingest::Options,
-    /// Print the tables as JSON
-    #[arg(long)]
-    json: bool,
-}
-
-#[derive(Args)]
-struct HealthArgs {
-    /// The server's address
-    #[arg(default_value = "127.0.0.1:8080", value_name = "ADDRESS:PORT")]
-    address: SocketAddr,
-}
 
 /// The exit code of a build that was asked to stop.
 const INTERRUPTED: u8 = 130;
