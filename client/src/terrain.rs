@@ -16,34 +16,37 @@
 
 mod decoders;
 mod imagery;
+mod options;
 mod reload;
 mod shares;
 mod shown;
+mod view;
 
 use crate::cache::{Cache, Index, Key};
 use crate::camera::{Camera, Plane};
-use crate::cut::{self, Ask, Drawing, Gpu, Ideal, Seen, Wish};
+use crate::cut::{self, Ask, Drawing, Gpu, Ideal, Wish};
 use crate::drawing::DrawItem;
 use crate::encoding::Encoding;
 use crate::fetch::{self, Event, FetchError, Fetcher, ROOT_BYTES, Traffic, Want};
 use crate::morph::{self, Change, Moment, Morphs};
-use crate::sight::Sight;
 use crate::surface::{Points, Surface, Tin};
 use crate::texture::{Drape, Draping};
 use bytes::Bytes;
 use decoders::{Decoders, Job};
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::message::{Layer, Scene, StreamAsk, StreamView};
-use diamantina_protocol::zone::{Mask, Zone};
+use diamantina_protocol::zone::Zone;
 use foldhash::fast::RandomState;
 use glam::DVec3;
 pub use imagery::Imagery;
+pub use options::{Options, TerrainError};
 use reload::Reload;
 use shares::Shares;
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 #[cfg(not(target_arch = "wasm32"))]
 use std::time::Duration;
+use view::ZoneView;
 use web_time::Instant;
 
 /// Wishes that are made however much is held: payloads may be waiting for these.
@@ -55,126 +58,6 @@ const EVENTS_MIN: usize = 64;
 /// Payloads of a stream that come one after another and are not wanted, until it is dropped: the eye has moved
 /// away, or there is no memory for more.
 const STRAYS_MAX: usize = 256;
-
-/// How to stream a scene.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Options {
-    /// The error to reach, in pixels.
-    pub tolerance_pixels: f64,
-    /// What heights are multiplied by, and errors with them.
-    pub exaggeration: f64,
-    /// How errors count on the screen.
-    pub sight: Sight,
-    /// Memory for surfaces and what is on its way to become one, in bytes. What the cut wants takes at most three quarters
-    /// of it: where that is too little for the tolerance, the largest errors are reduced first.
-    pub memory_bytes: usize,
-    /// GPU memory for the surfaces that are drawn and for their motions, in bytes. Where it is too little for the tolerance, the
-    /// largest errors are reduced first; where it is too little for motions, points jump.
-    pub gpu_bytes: u64,
-    /// Seconds that points take to move from one cut to the next, at most [`morph::SECONDS_MAX`]; 0: they jump.
-    pub morph_seconds: f64,
-    /// The names of the layers to stream and draw; none: all.
-    pub layers: Option<Vec<String>>,
-    /// The name of a zone: while the eye is in it, less is asked for where nothing is seen from there.
-    pub zone: Option<String>,
-    /// What lies on the terrain.
-    pub imagery: Imagery,
-    /// Memory for tiles of imagery, in bytes; as much again on the GPU.
-    pub texture_bytes: usize,
-    /// Seconds in which a tile of imagery takes the place of a coarser one; 0: at once.
-    pub fade_seconds: f64,
-    /// How to fetch, and in which encoding.
-    pub fetch: fetch::Options,
-}
-
-impl Default for Options {
-    fn default() -> Self {
-        Self {
-            tolerance_pixels: 1.0,
-            exaggeration: 1.0,
-            sight: Sight::default(),
-            memory_bytes: 512 << 20,
-            gpu_bytes: 512 << 20,
-            morph_seconds: 0.0,
-            layers: None,
-            zone: None,
-            imagery: Imagery::First,
-            texture_bytes: 128 << 20,
-            fade_seconds: 0.0,
-            fetch: fetch::Options::default(),
-        }
-    }
-}
-
-/// Why a scene cannot be streamed.
-#[derive(Debug, thiserror::Error)]
-pub enum TerrainError {
-    /// It cannot be fetched.
-    #[error(transparent)]
-    Fetch(#[from] FetchError),
-    /// Not in the encoding asked for.
-    #[error(
-        "layer '{layer}' is offered as {}, asked for as {asked}: build the store with --encoding points,tin, or \
-         leave --encoding {asked} out",
-        .offered.join(", ")
-    )]
-    Encoding {
-        /// The layer.
-        layer: String,
-        /// Encodings that the server offers.
-        offered: Vec<String>,
-        /// The encoding asked for.
-        asked: &'static str,
-    },
-    /// Motions of irregular triangles.
-    #[error("motions from cut to cut are of points: leave --morph or --encoding tin out")]
-    Still,
-    /// There is no such zone.
-    #[error(
-        "scene '{scene}' has no zone '{asked}'{}",
-        if .zones.is_empty() {
-            "; it has none at all: compute one with `diamantina-server zone`".to_owned()
-        } else {
-            format!(": it has {}", .zones.join(", "))
-        }
-    )]
-    Zone {
-        /// The scene.
-        scene: String,
-        /// The zone asked for.
-        asked: String,
-        /// The zones that there are.
-        zones: Vec<String>,
-    },
-    /// There is no such texture.
-    #[error(
-        "scene '{scene}' has no texture '{asked}'{}",
-        if .textures.is_empty() {
-            "; it has none at all: build it with --layer NAME=texture:PICTURE".to_owned()
-        } else {
-            format!(": it has {}", .textures.join(", "))
-        }
-    )]
-    Texture {
-        /// The scene.
-        scene: String,
-        /// The texture asked for.
-        asked: String,
-        /// The textures that there are.
-        textures: Vec<String>,
-    },
-    /// Not a number of pixels.
-    #[error("tolerance of {0} pixels: expected a number above 0")]
-    Tolerance(f64),
-    /// Not a number of seconds.
-    #[error("motions of {0} seconds: expected a number from 0 to {max}", max = morph::SECONDS_MAX)]
-    Morph(f64),
-    /// No threads.
-    #[error(
-        "cannot start a decoding thread: {0}: close other programs, or raise the limit on threads (ulimit -u)"
-    )]
-    Thread(#[from] std::io::Error),
-}
 
 /// What has happened since the scene was opened.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
@@ -286,35 +169,6 @@ pub struct Terrain {
     stats: Stats,
     view: Option<ZoneView>,
     draping: Option<Draping>,
-}
-
-/// What is seen from a zone.
-#[derive(Debug)]
-struct ZoneView {
-    zone: Zone,
-    /// Of each layer.
-    masks: Vec<Mask>,
-}
-
-impl ZoneView {
-    /// The scene's zone of this name.
-    fn find(scene: &Scene, name: &str) -> Result<Zone, TerrainError> {
-        let found = scene.zones.iter().find(|zone| zone.name == name);
-        found.cloned().ok_or_else(|| TerrainError::Zone {
-            scene: scene.name.clone(),
-            asked: name.to_owned(),
-            zones: scene.zones.iter().map(|zone| zone.name.clone()).collect(),
-        })
-    }
-
-    /// What counts of a layer's errors.
-    ///
-    /// What is hidden may seem higher by `angle` over its share, and no more, lest it rises above what hides it.
-    /// Where the tolerance, in radians, is larger than that angle, shares count for as much more.
-    fn seen(&self, layer: usize, tolerance: f64) -> Seen<'_> {
-        let coarser = if self.zone.angle > 0.0 { (tolerance / self.zone.angle).max(1.0) } else { 1.0 };
-        Seen { mask: &self.masks[layer], coarser }
-    }
 }
 
 #[derive(Debug)]
