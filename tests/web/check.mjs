@@ -146,17 +146,20 @@ async function heights(page, reference, blank, graphics) {
     return `${mean.toFixed(2)} from the client's picture, longest frame ${last.longest_frame_milliseconds.toFixed(0)} ms`;
 }
 
+/// Opens the page on what `query` asks for, and takes a picture without the panel once nothing changes any more.
+async function picture(page, graphics, query, name) {
+    const more = `&error=${ERROR_PIXELS}${graphics === 'webgl' ? '&graphics=webgl' : ''}`;
+    await page.goto('about:blank');
+    await page.goto(`${url}/?${query}${more}${hash(VIEW)}`);
+    await settled(page);
+    await page.keyboard.press('Tab');
+    await frames(page, 3);
+    return page.screenshot({ path: join(folder, `${graphics}-${name}.png`) });
+}
+
 /// Water: as the client draws it but for its waves, which move, and not where it is left out.
 async function water(page, blank, graphics) {
-    const query = `scene=lake&error=${ERROR_PIXELS}${graphics === 'webgl' ? '&graphics=webgl' : ''}`;
-    const shot = async (more, name) => {
-        await page.goto('about:blank');
-        await page.goto(`${url}/?${query}${more}${hash(VIEW)}`);
-        await settled(page);
-        await page.keyboard.press('Tab');
-        await frames(page, 3);
-        return page.screenshot({ path: join(folder, `${graphics}-${name}.png`) });
-    };
+    const shot = (more, name) => picture(page, graphics, `scene=lake${more}`, name);
     const dry = await shot('&layer=terrain', 'dry');
     const wet = await shot('', 'lake');
     const [beside, without] = [await compare(blank, [wet, lake]), await compare(blank, [wet, dry])];
@@ -169,15 +172,7 @@ async function water(page, blank, graphics) {
 
 /// Imagery: as the client draws it, and not where it is left out.
 async function imagery(page, blank, graphics) {
-    const query = `scene=photo&error=${ERROR_PIXELS}${graphics === 'webgl' ? '&graphics=webgl' : ''}`;
-    const shot = async (more, name) => {
-        await page.goto('about:blank');
-        await page.goto(`${url}/?${query}${more}${hash(VIEW)}`);
-        await settled(page);
-        await page.keyboard.press('Tab');
-        await frames(page, 3);
-        return page.screenshot({ path: join(folder, `${graphics}-${name}.png`) });
-    };
+    const shot = (more, name) => picture(page, graphics, `scene=photo${more}`, name);
     const [draped, bare] = [await shot('', 'photo'), await shot('&texture=none', 'bare')];
     const [beside, without] = [await compare(blank, [draped, photo]), await compare(blank, [draped, bare])];
     check(beside.mean < 2 && beside.off < 0.01, `imagery differs from the client's: ${JSON.stringify(beside)}`);
