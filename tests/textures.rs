@@ -270,6 +270,31 @@ fn tiles_and_their_index_are_served_and_all_else_is_refused() {
 }
 
 #[test]
+fn tiles_that_were_kept_are_drawn_without_a_server() {
+    let scratch = scratch();
+    build(&scratch, "--layer photo=texture:{}/photo.tif");
+    let served = serve(&[scratch.path().join("store")]);
+    let url = served.scene("world");
+    let picture = |name: &str, more: &str| {
+        let command = format!(
+            "render {url} --size 320x180 --no-antialias -o {{}}/{name}.png --json - --disk-cache {{}}/kept {more}"
+        );
+        let ended = client(scratch.path(), &command);
+        assert_eq!(ended.code, Some(0), "{ended:?}");
+        let report: serde_json::Value = serde_json::from_str(&ended.out).unwrap();
+        (std::fs::read(scratch.path().join(name).with_extension("png")).unwrap(), report)
+    };
+    let (fetched, told) = picture("fetched", "");
+    assert!(told["texture_tiles"].as_u64() >= Some(1), "{told}");
+    drop(served);
+    let (kept, offline) = picture("offline", "--offline");
+    assert_eq!(offline["texture_tiles"], told["texture_tiles"]);
+    assert_eq!((&offline["offline"], &offline["requests"]), (&true.into(), &0.into()), "{offline}");
+    assert!(kept == fetched, "other pictures");
+    assert!(picture("bare", "--offline --texture none").0 != fetched, "no imagery in either");
+}
+
+#[test]
 fn a_build_killed_while_tiles_are_made_is_gone_on_with() {
     let scratch = scratch();
     let options = "--layer photo=texture:{}/photo.tif --layer other=texture:{}/photo.png";
