@@ -1,11 +1,11 @@
-//! The exact criterion on one core: selection from the top, the same with pruning, greedy, the better of both (which
-//! is what `select` gives), and measuring what was found.
+//! The exact criterion on one core: selection from the top, the same with pruning (which is what `select` does), greedy,
+//! and measuring what was found.
 #![allow(clippy::cast_possible_truncation, reason = "heights below 3000 m")]
 
 use criterion::{Criterion as Bench, Throughput};
 use diamantina_server::experiment::field::Field;
 use diamantina_server::experiment::select::{
-    Criterion, Ground, Strategy, by_strategy, largest_error, select, top_down,
+    Criterion, Ground, Strategy, by_strategy, largest_error, top_down,
 };
 use std::hint::black_box;
 
@@ -38,9 +38,6 @@ fn main() {
         });
         group.bench_function(format!("greedy_{percent}_percent"), |b| {
             b.iter(|| by_strategy(&ground, Criterion::Vertical, black_box(tolerance), Strategy::Greedy));
-        });
-        group.bench_function(format!("select_{percent}_percent"), |b| {
-            b.iter(|| select(&ground, Criterion::Vertical, black_box(tolerance)));
         });
     }
     let tree = top_down(&ground, Criterion::Vertical, 0.01 * field.relief(), 0.0);

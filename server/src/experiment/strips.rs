@@ -1,11 +1,11 @@
 //! References of triangle strips beside separate triangles, and beside other orders of the same triangles.
 //!
-//! *Strip* is the one strip of the recursion. *Strips* are several, grown greedily from triangle to
-//! neighbour, with one restart reference between two. *Cached* is a list of separate triangles in the recursion's order,
+//! *Strip* is the one strip of the recursion, by the rules. *Shortest* keeps its path and chooses the corners' order in each
+//! triangle. *Strips* are several, grown greedily from triangle to neighbour, with one restart reference between two. *Cached* is a list of separate triangles in the recursion's order,
 //! told by the vertices that a first-in first-out cache of 32 has to fetch for it.
 
 use super::report::{Picture, Report, Table};
-use super::select::{Ground, Strategy, scale, select};
+use super::select::{Ground, scale, select};
 use super::{ExperimentError, Run, mean_and_spread, plot};
 use diamantina_protocol::bintree::Point;
 use diamantina_protocol::bitree::{Bitree, strip};
@@ -26,6 +26,8 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
         "line triangles",
         "strip references",
         "saved by the strip [%]",
+        "shortest strip's references",
+        "saved by the shortest strip [%]",
         "strips",
         "strips' references",
         "saved by the strips [%]",
@@ -36,9 +38,8 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     let mut sums = vec![Vec::new(); run.options.tolerances.len()];
     let steps = run.windows.len() * (run.options.tolerances.len() + 1);
     run.progress.stage("ordering", "meshes", steps as u64, 0);
-    // Percent that one strip and several save, by tolerance and window.
-    let mut saved =
-        [vec![Vec::new(); run.options.tolerances.len()], vec![Vec::new(); run.options.tolerances.len()]];
+    // Percent that the strip, the shortest and several save, by tolerance and window.
+    let mut saved: [_; 3] = std::array::from_fn(|_| vec![Vec::new(); run.options.tolerances.len()]);
     for window in run.windows {
         let Some(ground) = Ground::new(&window.field, window.weights.as_deref()) else { continue };
         let mut push = |label: [String; 2], tree: &Bitree| {
@@ -57,7 +58,7 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
             let (tree, strategy) = select(&ground, run.options.criterion, tolerance);
             let row = push([percent.to_string(), strategy.to_string()], &tree);
             saved.iter_mut().zip(row.saved).for_each(|(saved, one)| saved[i].push(one));
-            sums[i].push((strategy, row.counts));
+            sums[i].push(row.counts);
         }
     }
     let line = |(name, saved): (&str, &Vec<Vec<f64>>)| {
@@ -65,18 +66,20 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
         let points = points.map(|(percent, saved)| [*percent, mean_and_spread(saved)[0]]).collect();
         plot::Series { name: name.to_owned(), points }
     };
-    let series: Vec<plot::Series> =
-        ["one strip", "several strips"].into_iter().zip(&saved).map(line).collect();
+    let series: Vec<plot::Series> = ["one strip, by the rules", "one strip, the shortest", "several strips"]
+        .into_iter()
+        .zip(&saved)
+        .map(line)
+        .collect();
     let axes = ["tolerance [%]", "references saved [%]"];
     let bytes = plot::lines("Strips beside separate triangles", axes, false, &series)?;
     let caption = "References that strips save of separate triangles': means of the windows.".to_owned();
     Ok(Report {
         title: "Triangle strips".to_owned(),
-        notes: vec![
-            "Separate triangles take three references each. The selection is the better of compact and greedy, \
-             by points and then triangles."
-                .to_owned(),
-        ],
+        notes: vec![format!(
+            "Separate triangles take three references each. The selection is {}, the better way by this criterion.",
+            run.options.criterion.strategy()
+        )],
         tables: vec![means(run, &sums), table],
         pictures: vec![Picture { file: "strips.svg".to_owned(), caption, bytes }],
     })
@@ -85,61 +88,63 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
 /// What is told of a mesh.
 struct Row {
     cells: Vec<String>,
-    /// Percent that one strip and several save.
-    saved: [f64; 2],
-    /// Triangles, line triangles, and references: separate, of one strip, of several.
-    counts: [usize; 5],
+    /// Percent that the strip, the shortest and several save.
+    saved: [f64; 3],
+    /// Triangles, line triangles, and references: separate, of the strip, of the shortest, of several.
+    counts: [usize; 6],
 }
 
 fn row(tree: &Bitree) -> Row {
     let one = strip::strip(tree);
     let triangles = strip::triangles(&one);
+    let shortest = strip::shortest(tree).len();
     let several = greedy_strips(&triangles);
     let references = several.iter().map(Vec::len).sum::<usize>() + several.len().saturating_sub(1);
     let separate = 3 * triangles.len();
     let lines = strip::line_triangles(&one);
-    let saved = [one.len(), references].map(|n| 100.0 * (1.0 - n as f64 / separate as f64));
+    let saved = [one.len(), shortest, references].map(|n| 100.0 * (1.0 - n as f64 / separate as f64));
     let cells = vec![
         triangles.len().to_string(),
         separate.to_string(),
         lines.to_string(),
         one.len().to_string(),
         format!("{:.1}", saved[0]),
+        shortest.to_string(),
+        format!("{:.1}", saved[1]),
         several.len().to_string(),
         references.to_string(),
-        format!("{:.1}", saved[1]),
+        format!("{:.1}", saved[2]),
         format!("{:.3}", fetches(&triangles) as f64 / triangles.len() as f64),
     ];
-    Row { cells, saved, counts: [triangles.len(), lines, separate, one.len(), references] }
+    Row { cells, saved, counts: [triangles.len(), lines, separate, one.len(), shortest, references] }
 }
 
 /// The windows' means by tolerance; and what strips save of all their references together, in which large meshes count for more.
-fn means(run: &Run<'_>, sums: &[Vec<(Strategy, [usize; 5])>]) -> Table {
+fn means(run: &Run<'_>, sums: &[Vec<[usize; 6]>]) -> Table {
     let columns = [
         "tolerance [%]",
         "windows",
-        "of these compact",
         "triangles",
         "line triangles",
         "separate references",
         "strip references",
         "saved by the strip: mean of windows [%]",
         "saved by the strip: of all references [%]",
+        "saved by the shortest: mean of windows [%]",
+        "saved by the shortest: of all references [%]",
         "saved by the strips: mean of windows [%]",
         "saved by the strips: of all references [%]",
     ];
     let mut table = Table::new("means", "Means of the windows", &columns);
     for (percent, list) in run.options.tolerances.iter().zip(sums) {
-        let compact = list.iter().filter(|(strategy, _)| *strategy == Strategy::Compact).count();
-        let mean = |i: usize| list.iter().map(|(_, c)| c[i] as f64).sum::<f64>() / list.len().max(1) as f64;
+        let mean = |i: usize| list.iter().map(|c| c[i] as f64).sum::<f64>() / list.len().max(1) as f64;
         let saved = |i: usize| {
-            let each =
-                list.iter().map(|(_, c)| 100.0 * (1.0 - c[i] as f64 / c[2] as f64)).collect::<Vec<_>>();
+            let each = list.iter().map(|c| 100.0 * (1.0 - c[i] as f64 / c[2] as f64)).collect::<Vec<_>>();
             [mean_and_spread(&each)[0], 100.0 * (1.0 - mean(i) / mean(2))].map(|p| format!("{p:.1}"))
         };
         let counts = [0, 1, 2, 3].map(|i| format!("{:.1}", mean(i)));
-        let head = [percent.to_string(), list.len().to_string(), compact.to_string()];
-        table.push(head.into_iter().chain(counts).chain(saved(3)).chain(saved(4)));
+        let head = [percent.to_string(), list.len().to_string()];
+        table.push(head.into_iter().chain(counts).chain([3, 4, 5].into_iter().flat_map(saved)));
     }
     table
 }

@@ -123,7 +123,11 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
             run.options.criterion
         ),
         quadtrees(run.options.criterion).to_owned(),
-        format!("Fewest points, then triangles, in the mean: {}.", best(&found, &run.options.tolerances)),
+        format!(
+            "Fewest points, then triangles, in the mean: {}. Other tables select {}, the default by this criterion.",
+            best(&found, &run.options.tolerances),
+            run.options.criterion.strategy()
+        ),
     ];
     Ok(Report {
         title: "Bitree and restricted quadtree within tolerances".to_owned(),

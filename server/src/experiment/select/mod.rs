@@ -84,20 +84,12 @@ pub fn by_strategy(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, st
     tree
 }
 
-/// The better of a selection from the top and a greedy one: fewer points, then fewer triangles. Coefficients
-/// know only one way; and without any tolerance on heights every way finds the same points, those that are off.
+/// The points that keep a criterion's error of every triangle within `tolerance`, found in the better way for that
+/// criterion, [`Criterion::strategy`].
 #[must_use]
 pub fn select(ground: &Ground<'_>, criterion: Criterion, tolerance: f64) -> (Bitree, Strategy) {
-    if criterion == Criterion::Coefficient {
-        return (by_strategy(ground, criterion, tolerance, Strategy::Direct), Strategy::Direct);
-    }
-    if criterion == Criterion::Vertical && tolerance == 0.0 && ground.counts_all() {
-        return (by_strategy(ground, criterion, tolerance, Strategy::Compact), Strategy::Compact);
-    }
-    let size = |tree: &Bitree| (tree.points().0, tree.triangle_count());
-    let [first, second] = [Strategy::Compact, Strategy::Greedy]
-        .map(|strategy| (by_strategy(ground, criterion, tolerance, strategy), strategy));
-    if size(&second.0) < size(&first.0) { second } else { first }
+    let strategy = criterion.strategy();
+    (by_strategy(ground, criterion, tolerance, strategy), strategy)
 }
 
 /// At most `points` points, corners included, the largest errors first.
