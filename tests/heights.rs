@@ -93,12 +93,13 @@ fn every_sample_and_every_edge_of_small_dems_is_within_the_declared_error() {
     let folder = tempfile::tempdir().unwrap();
     let (dem, store) = (folder.path().join("dem.raw"), folder.path().join("store"));
     // Of one root and of several, full and ragged, thin.
-    let sizes =
-        [([65, 65], 5), ([129, 65], 5), ([64, 97], 5), ([200, 70], 5), ([260, 3], 6), ([129, 129], 6)];
+    let sizes = [([65, 65], 5), ([97, 65], 5), ([40, 49], 5), ([140, 40], 5), ([260, 3], 6), ([129, 129], 6)];
     for (size, patch_log2) in sizes {
-        for (max_error, rule) in
-            [(0.0, Rule::Smooth), (0.0, Rule::Midpoint), (3.0, Rule::Smooth), (3.0, Rule::Midpoint)]
-        {
+        // The other codings at sizes of several ragged roots alone: the rest takes minutes.
+        let codings =
+            [(0.0, Rule::Smooth), (0.0, Rule::Midpoint), (3.0, Rule::Smooth), (3.0, Rule::Midpoint)];
+        let is_ragged = matches!(size, [40, 49] | [260, 3]);
+        for (max_error, rule) in codings.into_iter().take(if is_ragged { 4 } else { 1 }) {
             let ingest = write_raw(&dem, size, hills);
             let options = hierarchy::Options { max_error, rule, patch_log2, ..options() };
             build(&dem, &store, &ingest, &options);

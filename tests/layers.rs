@@ -170,7 +170,7 @@ fn source_samples(source: &Source) -> u64 {
 
 #[test]
 fn threads_memory_and_kills_change_no_byte_of_any_layer() {
-    let pair = Pair::new(1100);
+    let pair = Pair::new(800);
     let options = "--encoding points,tin --checkpoint 0";
     let began = Instant::now();
     let (whole, _) = pair.build("whole", &format!("{options} --threads 1"));

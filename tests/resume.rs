@@ -102,8 +102,8 @@ fn killed_again_and_again_until_it_ends_a_build_gives_the_same_bytes() {
         let threads = 1 + dice.below(3);
         let build = words(folder, &format!("{BUILD} --threads {threads}"));
         let child = start(&programs().server, &build);
-        // Longer from kill to kill, so that the loop ends on any machine.
-        let longest = unbroken.whole.mul_f64(0.25 + 0.05 * f64::from(kills));
+        // Short at first, however slow the unbroken build was; longer from kill to kill, so that the loop ends on any machine.
+        let longest = unbroken.whole.mul_f64(0.1 + 0.05 * f64::from(kills));
         std::thread::sleep(longest.mul_f64(dice.roll()));
         let _ = Command::new("kill").args(["-KILL", &child.id().to_string()]).status();
         let ended = end(child);
