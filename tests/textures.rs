@@ -6,8 +6,9 @@ use crate::world::{programs, serve};
 use diamantina_client::camera::{Camera, FOV_Y};
 use diamantina_client::headless;
 use diamantina_client::picture::Picture;
-use diamantina_client::render::{self, Background, Imagery as Shown, Look};
+use diamantina_client::render::{self, Background, Imagery as Shown, Look, Offscreen};
 use diamantina_client::terrain::{self, Imagery, Terrain};
+use diamantina_client::texture::Coding;
 use diamantina_protocol::message;
 use diamantina_protocol::texture::{Coverage, INNER, Tile, coverage_bytes};
 use diamantina_server::store::Store;
@@ -121,7 +122,11 @@ fn bare() -> Look {
 }
 
 fn draw(url: &str, camera: &Camera, imagery: Imagery) -> Picture {
-    let options = terrain::Options { imagery, ..terrain::Options::default() };
+    draw_as(url, camera, imagery, Coding::Plain)
+}
+
+fn draw_as(url: &str, camera: &Camera, imagery: Imagery, texture_coding: Coding) -> Picture {
+    let options = terrain::Options { imagery, texture_coding, ..terrain::Options::default() };
     let mut terrain = Terrain::open(url, options).unwrap();
     let options = render::Options { samples: 1, ..render::Options::default() };
     let drawn = headless::picture(&mut terrain, camera, &bare(), &options, Duration::from_secs(60));
@@ -156,8 +161,9 @@ fn every_pixel_shows_the_image_where_it_lies_without_seams() {
     let served = serve(&[scratch.path().join("store")]);
     let url = served.scene("world");
     for (number, camera) in views().iter().enumerate() {
-        let picture = draw(&url, camera, Imagery::First);
+        let whole = draw(&url, camera, Imagery::First);
         let plain = draw(&url, camera, Imagery::None);
+        let in_blocks = (number == 1).then(|| draw_as(&url, camera, Imagery::First, Coding::Blocks));
         let (mut seen, mut largest, mut outside) = (0, 0.0f64, 0);
         for at in (0..300).flat_map(|y| (0..400).map(move |x| [x, y])) {
             let Some([x, y]) = ground(camera, at) else { continue };
@@ -169,18 +175,32 @@ fn every_pixel_shows_the_image_where_it_lies_without_seams() {
             };
             let from_hole = (x - HOLE.0[0]).hypot(y - HOLE.0[1]) - HOLE.1;
             if inside(rim) && from_hole > rim {
-                let found = pixel(&picture, at).map(f64::from);
+                let found = pixel(&whole, at).map(f64::from);
                 let expected = colour(place);
-                let off = (0..3).map(|i| (found[i] - expected[i]).abs()).fold(0.0, f64::max);
+                let off =
+                    |found: [f64; 3]| (0..3).map(|i| (found[i] - expected[i]).abs()).fold(0.0, f64::max);
+                if let Some(picture) = &in_blocks {
+                    let found = pixel(picture, at).map(f64::from);
+                    assert!(off(found) <= 12.0, "in blocks, {at:?}: {found:?}, expected {expected:?}");
+                }
+                let off = off(found);
                 largest = largest.max(off);
                 // From far a pixel shows tens of metres, over which colours change.
                 let limit = if number == 3 { 12.0 } else { 6.0 };
                 assert!(off <= limit, "view {number}, pixel {at:?}: {found:?}, expected {expected:?}");
                 seen += 1;
             } else if !inside(-rim) || from_hole < -rim {
-                assert_eq!(pixel(&picture, at), pixel(&plain, at), "view {number}, pixel {at:?} is outside");
+                assert_eq!(pixel(&whole, at), pixel(&plain, at), "view {number}, pixel {at:?} is outside");
                 outside += 1;
             }
+        }
+        if let Some(picture) = &in_blocks {
+            let reads_blocks = Offscreen::new(&render::Options::default()).unwrap().reads_blocks();
+            assert_eq!(
+                picture.pixels != whole.pixels,
+                reads_blocks,
+                "not in blocks after all, or drawn without"
+            );
         }
         println!("view {number}: {seen} pixels of the image, at most {largest:.1} off; {outside} outside");
         assert!(seen > [10_000, 80_000, 20_000, 1000][number], "view {number}: {seen}");

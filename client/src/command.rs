@@ -18,7 +18,7 @@ use diamantina_client::morph;
 use diamantina_client::render::{self, Look};
 use diamantina_client::sight::Sight;
 use diamantina_client::terrain::{self, Imagery, Terrain, TerrainError};
-use diamantina_client::texture::FADE_SECONDS;
+use diamantina_client::texture::{Coding, FADE_SECONDS};
 use diamantina_client::viewer::{self, Viewer};
 use glam::DVec3;
 use keep::{KeepArgs, Kept, tell_offline};
@@ -122,6 +122,10 @@ struct ViewArgs {
     /// Memory for tiles of imagery, at most 1000MiB, and as much again on the GPU; where it is too little, imagery is coarser
     #[arg(long, default_value = "128MiB", value_name = "SIZE", value_parser = parse_bytes)]
     texture_memory: u64,
+    /// Keep imagery in blocks (BC7) where the graphics card reads them: four times as many tiles in --texture-memory, in colours
+    /// that are a little off. Adapters in software draw them slowly [default: on for view but in software, else off]
+    #[arg(long, value_name = "on|off", value_enum)]
+    texture_compression: Option<Switch>,
     /// Memory for decoded diamonds; where it is too little for the error asked for, the view is coarser
     #[arg(long, default_value = "1GiB", value_name = "SIZE", value_parser = parse_bytes)]
     memory: u64,
@@ -141,6 +145,12 @@ struct ViewArgs {
 enum EncodingName {
     Points,
     Tin,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Switch {
+    On,
+    Off,
 }
 
 #[derive(Args)]
@@ -278,7 +288,13 @@ impl ViewArgs {
         render::Options { budget_bytes: self.gpu_memory, ..self.look.options() }
     }
 
-    fn open(&self, morph_seconds: f64, disk: Option<&Disk>) -> Result<Terrain, Failure> {
+    /// `blocks_by_default`: whether imagery is kept in blocks unless something else is asked for.
+    fn open(
+        &self,
+        morph_seconds: f64,
+        disk: Option<&Disk>,
+        blocks_by_default: bool,
+    ) -> Result<Terrain, Failure> {
         if !(self.error_pixels.is_finite() && self.error_pixels > 0.0) {
             return Err(Failure(
                 2,
@@ -289,6 +305,9 @@ impl ViewArgs {
         self.annotate.check(self.size)?;
         if self.look.is_true && morph_seconds > 0.0 {
             return Err(untrue("--morph", "what is drawn is what has arrived"));
+        }
+        if self.look.is_true && self.texture_compression == Some(Switch::On) {
+            return Err(untrue("--texture-compression on", "imagery is shown as it was taken"));
         }
         if !(self.foveation.is_finite() && self.foveation >= 1.0) {
             return Err(Failure(2, format!("--foveation {}: expected a number from 1 on", self.foveation)));
@@ -318,6 +337,10 @@ impl ViewArgs {
                 asked => Imagery::asked(asked.clone()),
             },
             texture_bytes: usize::try_from(self.texture_memory).unwrap_or(usize::MAX),
+            texture_coding: Coding::blocks_if(match self.texture_compression {
+                Some(asked) => asked == Switch::On,
+                None => blocks_by_default && !self.look.is_true,
+            }),
             fade_seconds: if morph_seconds > 0.0 { FADE_SECONDS.min(morph_seconds) } else { 0.0 },
             ..terrain::Options::default()
         };
@@ -343,7 +366,7 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
         return Err(Failure(2, "streams are of points: leave --stream or --encoding tin out".to_owned()));
     }
     let kept = args.view.keep.open(false)?;
-    let mut terrain = args.view.open(0.0, kept.0.as_ref())?;
+    let mut terrain = args.view.open(0.0, kept.0.as_ref(), false)?;
     let ViewArgs { size, .. } = args.view;
     let exaggeration = args.view.look.exaggeration;
     let camera = match (args.eye, args.target) {
@@ -442,7 +465,7 @@ fn view(args: &ViewerArgs) -> Result<(), Failure> {
     };
     let view = ViewArgs { url: url.clone(), ..args.view.clone() };
     let kept = if args.no_disk_cache { Kept(None) } else { view.keep.open(true)? };
-    let terrain = view.open(morph, kept.0.as_ref())?;
+    let terrain = view.open(morph, kept.0.as_ref(), true)?;
     let look = view.look(&terrain);
     let title = format!("{} - Diamantina", terrain.scene().name);
     let viewer = Viewer::new(terrain, &url, look, view.size, at);
@@ -505,7 +528,7 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
         return Err(Failure(2, format!("--seconds {found}: expected seconds above 0, at most {most}")));
     }
     let kept = args.view.keep.open(false)?;
-    let mut terrain = args.view.open(args.morph, kept.0.as_ref())?;
+    let mut terrain = args.view.open(args.morph, kept.0.as_ref(), false)?;
     let path = path.unwrap_or_else(|| {
         let scene = terrain.shown_scene();
         args.random

@@ -10,6 +10,7 @@ use crate::picture::{Picture, write_png};
 use crate::render::{self, FrameStats, Look, Offscreen, RenderError};
 use crate::surface::Surface;
 use crate::terrain::{FrameView, Stats, Terrain, TerrainError};
+use crate::texture::Coding;
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::message::{Layer, Scene};
@@ -205,6 +206,13 @@ pub struct PictureReport {
     pub milliseconds_a_frame: f64,
 }
 
+/// Has imagery come as what draws it takes it.
+fn fit(terrain: &mut Terrain, offscreen: &Offscreen) {
+    if !offscreen.reads_blocks() {
+        terrain.set_texture_coding(Coding::Plain);
+    }
+}
+
 /// Streams until the camera's view is as exact as asked, and draws it. Gives up waiting after `patience`
 /// and draws what is there. Where the look stretches heights, the camera's are stretched, too.
 ///
@@ -218,6 +226,7 @@ pub fn picture(
     patience: Duration,
 ) -> Result<(Picture, PictureReport), HeadlessError> {
     let mut offscreen = Offscreen::new(options)?;
+    fit(terrain, &offscreen);
     let drawn = stretched(camera, look.exaggeration);
     terrain.set_exaggeration(look.exaggeration);
     terrain.set_wires(look.wireframe);
@@ -616,6 +625,7 @@ pub fn fly(
     mut each: impl FnMut(&FrameLine, Option<&Picture>) -> Result<(), HeadlessError>,
 ) -> Result<(), HeadlessError> {
     let mut offscreen = Offscreen::new(options)?;
+    fit(terrain, &offscreen);
     terrain.set_exaggeration(look.exaggeration);
     // Of a version of the scene.
     let mut annotator: Option<(String, Annotator)> = None;

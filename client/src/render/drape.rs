@@ -7,8 +7,9 @@
 use super::frame::single;
 use super::view::View;
 use crate::camera::Bounds;
-use crate::texture::{Drape, TILE_BYTES, TileImage, within};
+use crate::texture::{Coding, Drape, TileImage, plain, within};
 use diamantina_protocol::texture::{SIDE, Texture, Tile};
+use std::borrow::Cow;
 use std::collections::HashMap;
 use std::sync::{Arc, Weak};
 
@@ -44,6 +45,8 @@ pub(super) struct Drapes {
     nodes: wgpu::Texture,
     /// Made when there is imagery to show; before, a sheet of nothing.
     sheets: wgpu::Texture,
+    /// How texels lie in the sheets.
+    coding: Coding,
     capacity: usize,
     group: wgpu::BindGroup,
     /// The pictures that are there, with their place.
@@ -102,13 +105,14 @@ impl Drapes {
             usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
             view_formats: &[],
         });
-        let sheets = sheets(device, SIDE, 1);
+        let sheets = sheets(device, Coding::Plain, SIDE, 1);
         let group = group(device, &layout, &nodes, &sheets, &sampler);
         Self {
             layout,
             sampler,
             nodes,
             sheets,
+            coding: Coding::Plain,
             capacity: 0,
             group,
             places: HashMap::new(),
@@ -138,8 +142,9 @@ impl Drapes {
         self.texture = drape.map(|drape| Arc::clone(&drape.texture));
         self.numbers.clear();
         let Some(drape) = drape else { return 0 };
-        if drape.capacity > self.capacity {
-            self.grow(device, drape.capacity);
+        let coding = if reads_blocks(device) { drape.coding } else { Coding::Plain };
+        if drape.capacity > self.capacity || coding != self.coding {
+            self.grow(device, drape.capacity, coding);
         }
         let (free, places) = (&mut self.free, &mut self.places);
         let images: HashMap<Tile, &Arc<TileImage>> =
@@ -159,8 +164,8 @@ impl Drapes {
                 // No frame shows more than the capacity.
                 None => {
                     let Some(place) = self.free.pop() else { continue };
-                    upload(queue, &self.sheets, place, draped.image.texels());
-                    uploaded += draped.image.texels().len() as u64;
+                    upload(queue, &self.sheets, coding, place, &draped.image);
+                    uploaded += coding.tile_bytes() as u64;
                     self.places.insert(draped.tile, (place, Arc::downgrade(&draped.image)));
                     place
                 }
@@ -189,15 +194,15 @@ impl Drapes {
     }
 
     /// Makes room for so many pictures. Those that were there have to come again.
-    fn grow(&mut self, device: &wgpu::Device, capacity: usize) {
+    fn grow(&mut self, device: &wgpu::Device, capacity: usize, coding: Coding) {
         let wanted = u32::try_from(capacity).unwrap_or(u32::MAX).div_ceil(IN_SHEET);
         let count = wanted.clamp(1, device.limits().max_texture_array_layers);
-        self.sheets = sheets(device, ACROSS * SIDE, count);
+        self.sheets = sheets(device, coding, ACROSS * SIDE, count);
         self.group = group(device, &self.layout, &self.nodes, &self.sheets, &self.sampler);
-        self.capacity = capacity;
+        (self.capacity, self.coding) = (capacity, coding);
         self.places.clear();
         self.free = (0..count * IN_SHEET).rev().collect();
-        self.bytes = u64::from(count * IN_SHEET) * TILE_BYTES as u64;
+        self.bytes = u64::from(count * IN_SHEET) * coding.tile_bytes() as u64;
     }
 
     fn tell(&self, queue: &wgpu::Queue, nodes: &[Node]) {
@@ -245,14 +250,22 @@ impl Drapes {
     }
 }
 
-fn sheets(device: &wgpu::Device, side: u32, count: u32) -> wgpu::Texture {
+/// Whether a device takes texels in blocks as they are.
+pub(super) fn reads_blocks(device: &wgpu::Device) -> bool {
+    device.features().contains(wgpu::Features::TEXTURE_COMPRESSION_BC)
+}
+
+fn sheets(device: &wgpu::Device, coding: Coding, side: u32, count: u32) -> wgpu::Texture {
     device.create_texture(&wgpu::TextureDescriptor {
         label: Some("imagery"),
         size: wgpu::Extent3d { width: side, height: side, depth_or_array_layers: count },
         mip_level_count: 1,
         sample_count: 1,
         dimension: wgpu::TextureDimension::D2,
-        format: wgpu::TextureFormat::Rgba8UnormSrgb,
+        format: match coding {
+            Coding::Plain => wgpu::TextureFormat::Rgba8UnormSrgb,
+            Coding::Blocks => wgpu::TextureFormat::Bc7RgbaUnormSrgb,
+        },
         usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
         view_formats: &[],
     })
@@ -281,12 +294,17 @@ fn group(
     })
 }
 
-fn upload(queue: &wgpu::Queue, sheets: &wgpu::Texture, place: u32, texels: &[u8]) {
+fn upload(queue: &wgpu::Queue, sheets: &wgpu::Texture, coding: Coding, place: u32, image: &TileImage) {
     let cell = place % IN_SHEET;
     let origin = wgpu::Origin3d { x: cell % ACROSS * SIDE, y: cell / ACROSS * SIDE, z: place / IN_SHEET };
+    let texels = match (image.coding(), coding) {
+        (Coding::Blocks, Coding::Plain) => Cow::Owned(plain(image.texels())),
+        _ => Cow::Borrowed(image.texels()),
+    };
     queue.write_texture(
         wgpu::TexelCopyTextureInfo { origin, ..sheets.as_image_copy() },
-        texels,
+        &texels,
+        // Of blocks, too: 16 bytes for four texels of a row, and a row of them is four texels high.
         wgpu::TexelCopyBufferLayout { offset: 0, bytes_per_row: Some(4 * SIDE), rows_per_image: None },
         wgpu::Extent3d { width: SIDE, height: SIDE, depth_or_array_layers: 1 },
     );

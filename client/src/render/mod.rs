@@ -171,6 +171,8 @@ pub(crate) async fn device(
     let limits = wgpu::Limits::downlevel_webgl2_defaults().using_resolution(adapter.limits());
     let request = adapter.request_device(&wgpu::DeviceDescriptor {
         label: Some(label),
+        // Imagery takes less where there are blocks.
+        required_features: adapter.features() & wgpu::Features::TEXTURE_COMPRESSION_BC,
         required_limits: limits,
         ..Default::default()
     });
@@ -378,6 +380,12 @@ impl Renderer {
         (self.lens, self.water, self.attachments) = (Some(lens), water, Some(attachments));
         self.queue.submit([encoder.finish()]);
         stats
+    }
+
+    /// Whether tiles of imagery may come as blocks: where they do all the same, they are coded anew.
+    #[must_use]
+    pub fn reads_blocks(&self) -> bool {
+        drape::reads_blocks(&self.device)
     }
 
     /// Lays imagery on the terrain in the frames from now on, or none: uploads tiles not seen before.

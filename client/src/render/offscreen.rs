@@ -37,6 +37,12 @@ impl Offscreen {
         self.renderer.drape(drape);
     }
 
+    /// See [`Renderer::reads_blocks`].
+    #[must_use]
+    pub fn reads_blocks(&self) -> bool {
+        self.renderer.reads_blocks()
+    }
+
     /// Draws a frame of `camera.size` pixels. See [`Renderer::draw`].
     ///
     /// # Errors

@@ -4,7 +4,7 @@ use super::{FrameView, Terrain, TerrainError};
 use crate::camera::{Bounds, Camera, nearest_drawn};
 use crate::cut;
 use crate::fetch::{self, FetchError, Want};
-use crate::texture::{Draping, capacity};
+use crate::texture::{Coding, Draping};
 use diamantina_protocol::message::{Kind, Scene};
 
 /// Which imagery lies on the terrain.
@@ -64,6 +64,10 @@ impl Terrain {
             None => Imagery::None,
             Some(number) => Imagery::Named(self.scene.textures[number].name.clone()),
         };
+        self.start_draping(number);
+    }
+
+    fn start_draping(&mut self, number: Option<usize>) {
         self.draping = None;
         if let Some(number) = number {
             match self.drape(number) {
@@ -75,7 +79,18 @@ impl Terrain {
 
     pub(super) fn drape(&self, number: usize) -> std::io::Result<Draping> {
         let texture = &self.scene.textures[number];
-        Draping::start(number, texture, capacity(self.options.texture_bytes), self.options.fade_seconds)
+        let super::Options { texture_bytes, texture_coding, fade_seconds, .. } = &self.options;
+        Draping::start(number, texture, *texture_bytes, *texture_coding, *fade_seconds)
+    }
+
+    /// How the texels of imagery are to be coded from now on: as whatever draws them takes them. Tiles that are there
+    /// come again, from the disk cache if there is one.
+    pub fn set_texture_coding(&mut self, coding: Coding) {
+        if self.options.texture_coding != coding {
+            self.options.texture_coding = coding;
+            let number = self.texture();
+            self.start_draping(number);
+        }
     }
 
     /// Takes what has been decoded of tiles.

@@ -4,6 +4,7 @@ use super::Imagery;
 use crate::fetch::{self, FetchError};
 use crate::morph;
 use crate::sight::Sight;
+use crate::texture::Coding;
 
 /// How to stream a scene.
 #[derive(Debug, Clone, PartialEq)]
@@ -30,6 +31,8 @@ pub struct Options {
     pub imagery: Imagery,
     /// Memory for tiles of imagery, in bytes; as much again on the GPU.
     pub texture_bytes: usize,
+    /// How their texels are coded.
+    pub texture_coding: Coding,
     /// Seconds in which a tile of imagery takes the place of a coarser one; 0: at once.
     pub fade_seconds: f64,
     /// How to fetch, and in which encoding.
@@ -49,6 +52,7 @@ impl Default for Options {
             zone: None,
             imagery: Imagery::First,
             texture_bytes: 128 << 20,
+            texture_coding: Coding::Plain,
             fade_seconds: 0.0,
             fetch: fetch::Options::default(),
         }

@@ -3,6 +3,7 @@
 //! Natively in Rust, on threads of its own; in a browser by the browser, which does it on its own threads and has the
 //! program for it already.
 
+use super::coding::{Coding, blocks};
 use crate::background::Background;
 use bytes::Bytes;
 use diamantina_protocol::texture::{self, SIDE, Tile};
@@ -13,6 +14,7 @@ use std::sync::mpsc;
 #[derive(Debug, PartialEq, Eq)]
 pub struct TileImage {
     texels: Vec<u8>,
+    coding: Coding,
 }
 
 impl TileImage {
@@ -21,11 +23,29 @@ impl TileImage {
     /// # Errors
     /// When there are more or fewer, in words.
     pub fn new(mut texels: Vec<u8>) -> Result<Self, String> {
-        if texels.len() != super::TILE_BYTES {
-            return Err(format!("{} bytes of texels, expected {}", texels.len(), super::TILE_BYTES));
+        let expected = Coding::Plain.tile_bytes();
+        if texels.len() != expected {
+            return Err(format!("{} bytes of texels, expected {expected}", texels.len()));
         }
         texels.as_chunks_mut::<4>().0.iter_mut().for_each(multiply);
-        Ok(Self { texels })
+        Ok(Self { texels, coding: Coding::Plain })
+    }
+
+    /// The same picture in another coding. To blocks and back is not the same again.
+    #[must_use]
+    pub fn coded(self, coding: Coding) -> Self {
+        let texels = match (self.coding, coding) {
+            (Coding::Plain, Coding::Blocks) => blocks(&self.texels),
+            (Coding::Blocks, Coding::Plain) => super::coding::plain(&self.texels),
+            _ => self.texels,
+        };
+        Self { texels, coding }
+    }
+
+    /// How the texels are coded.
+    #[must_use]
+    pub fn coding(&self) -> Coding {
+        self.coding
     }
 
     /// The bytes of the texels.
@@ -58,21 +78,24 @@ type Decoded = (Tile, Result<TileImage, String>);
 /// Decodes in the background.
 #[derive(Debug)]
 pub(super) struct Decoder {
+    coding: Coding,
     background: Background,
     sender: mpsc::Sender<Decoded>,
     decoded: mpsc::Receiver<Decoded>,
 }
 
 impl Decoder {
-    pub(super) fn start() -> std::io::Result<Self> {
+    /// Gives pictures in this coding.
+    pub(super) fn start(coding: Coding) -> std::io::Result<Self> {
         let (sender, decoded) = mpsc::channel();
-        Ok(Self { background: Background::start("diamantina-tiles")?, sender, decoded })
+        Ok(Self { coding, background: Background::start("diamantina-tiles")?, sender, decoded })
     }
 
     pub(super) fn submit(&self, tile: Tile, picture: Bytes) {
-        let sender = self.sender.clone();
+        let (sender, coding) = (self.sender.clone(), self.coding);
         self.background.spawn(async move {
             let image = driver::texels(&picture).await.and_then(TileImage::new);
+            let image = image.map(|image| image.coded(coding));
             // Nobody waits for it any more when the texture is dropped.
             let _ = sender.send((tile, image));
         });

@@ -12,21 +12,21 @@
 //! coarsest comes first.
 
 mod choose;
+mod coding;
 mod decode;
 
 pub use choose::{wanted, within};
+pub use coding::Coding;
+pub(crate) use coding::plain;
 pub use decode::TileImage;
 
 use crate::camera::{Bounds, Camera};
 use bytes::Bytes;
 use decode::Decoder;
-use diamantina_protocol::texture::{Coverage, SIDE, Texture, Tile};
+use diamantina_protocol::texture::{Coverage, Texture, Tile};
 use foldhash::fast::RandomState;
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
-
-/// Bytes of a tile's picture on the GPU, and in memory.
-pub const TILE_BYTES: usize = 4 * (SIDE * SIDE) as usize;
 
 /// Tiles wished for at once: the eye may have moved on before more of them have come.
 const WISHES_MAX: usize = 48;
@@ -60,12 +60,14 @@ pub struct Drape {
     pub tiles: Vec<DrapedTile>,
     /// The most tiles that any frame shows.
     pub capacity: usize,
+    /// How the texels of all of them are coded.
+    pub coding: Coding,
 }
 
 /// How many tiles fit into so many bytes.
 #[must_use]
-pub fn capacity(bytes: usize) -> usize {
-    (bytes / TILE_BYTES).clamp(16, choose::TILES_MAX)
+pub fn capacity(bytes: usize, coding: Coding) -> usize {
+    (bytes / coding.tile_bytes()).clamp(16, choose::TILES_MAX)
 }
 
 #[derive(Debug)]
@@ -86,6 +88,7 @@ pub struct Draping {
     /// Once it has come.
     coverage: Option<Coverage>,
     capacity: usize,
+    coding: Coding,
     frame: u64,
     held: HashMap<Tile, Held, RandomState>,
     decoder: Decoder,
@@ -111,24 +114,27 @@ pub struct Step {
 }
 
 impl Draping {
-    /// A texture, by its position in the scene, of which so many tiles are kept, and taken in within so many seconds.
+    /// A texture, by its position in the scene, of which as many tiles are kept as fit into so many bytes in a coding, and taken
+    /// in within so many seconds.
     ///
     /// # Errors
     /// When there are no threads to decode with.
     pub fn start(
         number: usize,
         texture: &Texture,
-        capacity: usize,
+        bytes: usize,
+        coding: Coding,
         fade_seconds: f64,
     ) -> std::io::Result<Self> {
         Ok(Self {
             number,
             texture: Arc::new(texture.clone()),
             coverage: None,
-            capacity,
+            capacity: capacity(bytes, coding),
+            coding,
             frame: 0,
             held: HashMap::default(),
-            decoder: Decoder::start()?,
+            decoder: Decoder::start(coding)?,
             decoding: HashSet::default(),
             wanted: HashSet::default(),
             fade_seconds,
@@ -217,6 +223,7 @@ impl Draping {
             texture: Arc::clone(&self.texture),
             tiles: shown,
             capacity: self.capacity,
+            coding: self.coding,
         });
         step
     }

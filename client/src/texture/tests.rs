@@ -1,6 +1,6 @@
 use super::*;
 use crate::camera::FOV_Y;
-use diamantina_protocol::texture::INNER;
+use diamantina_protocol::texture::{INNER, SIDE};
 use glam::DVec3;
 use proptest::prelude::*;
 
@@ -71,7 +71,7 @@ fn the_tile_within_which_a_rectangle_lies_is_the_finest_such() {
 
 fn image() -> Bytes {
     let mut bytes = Vec::new();
-    let texels = vec![200; TILE_BYTES];
+    let texels = vec![200; Coding::Plain.tile_bytes()];
     image_webp::WebPEncoder::new(&mut bytes)
         .encode(&texels, SIDE, SIDE, image_webp::ColorType::Rgba8)
         .unwrap();
@@ -98,33 +98,45 @@ fn settle(draping: &mut Draping, camera: &Camera) -> Step {
 
 #[test]
 fn memory_is_held_and_the_shown_hold_their_parents_wherever_the_eye_goes() {
+    let bytes = 20 * Coding::Plain.tile_bytes();
+    hold(bytes, Coding::Plain, 20);
+    // Of blocks, four times as many.
+    hold(bytes, Coding::Blocks, 80);
+}
+
+fn hold(bytes: usize, coding: Coding, most: usize) {
     let (texture, coverage) = texture();
-    let mut draping = Draping::start(0, &texture, 20, 0.0).unwrap();
+    let mut draping = Draping::start(0, &texture, bytes, coding, 0.0).unwrap();
     assert!(draping.step(&above(0.0, 0.0, 10.0), &[ground()], 1.0, 0.0).lacks_coverage);
     draping.set_coverage(coverage);
+    let mut largest = 0;
     for (x, y, height) in
         [(1500.0, 0.0, 300.0), (3000.0, 500.0, 200.0), (2000.0, 200.0, 5000.0), (1200.0, -400.0, 90.0)]
     {
         let step = settle(&mut draping, &above(x, y, height));
         let drape = step.drape.unwrap();
         assert!(
-            drape.tiles.len() <= 20 && draping.tiles() <= 20,
+            drape.tiles.len() <= most && draping.tiles() <= most && draping.bytes() <= bytes,
             "{} {}",
             drape.tiles.len(),
             draping.tiles()
         );
+        assert_eq!(drape.coding, coding);
+        largest = largest.max(drape.tiles.len());
         let shown: Vec<Tile> = drape.tiles.iter().map(|draped| draped.tile).collect();
         for (i, tile) in shown.iter().enumerate() {
             assert!(tile.parent().is_none_or(|parent| shown[..i].contains(&parent)), "{tile:?}");
         }
         assert!(drape.tiles.iter().all(|draped| draped.weight == 1.0));
     }
+    assert!(largest >= most.min(21), "{largest} tiles of {most}");
 }
 
 #[test]
 fn tiles_fade_in_and_damaged_ones_are_told() {
     let (texture, coverage) = texture();
-    let mut draping = Draping::start(0, &texture, 100, 0.5).unwrap();
+    let mut draping =
+        Draping::start(0, &texture, 100 * Coding::Plain.tile_bytes(), Coding::Plain, 0.5).unwrap();
     draping.set_coverage(coverage);
     let camera = above(1500.0, 0.0, 200.0);
     let picture = image();

@@ -37,7 +37,7 @@ use crate::overview;
 use crate::pick::{Hit, Picker, Ray};
 use crate::render::{FrameStats, Look};
 use crate::terrain::{FrameView, Terrain};
-use crate::texture::Drape;
+use crate::texture::{Coding, Drape};
 use bookmarks::Bookmarks;
 use diamantina_protocol::message::Kind;
 use egui::{Event, Key, Modifiers, Painter, PointerButton, Rect, Sense, Ui};
@@ -164,6 +164,13 @@ impl Viewer {
     #[must_use]
     pub fn terrain(&self) -> &Terrain {
         &self.terrain
+    }
+
+    /// Has imagery come as suits what draws it.
+    pub fn fit(&mut self, suits_blocks: bool) {
+        if !suits_blocks {
+            self.terrain.set_texture_coding(Coding::Plain);
+        }
     }
 
     /// What the last frame shows.

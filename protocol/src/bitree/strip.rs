@@ -214,7 +214,7 @@ mod tests {
         // Two triangles share a side: nobody needs more than the four corners. Four around a centre: six at least.
         let square = Bitree::new(1, [0.0; 4]).unwrap();
         assert_eq!((strip(&square).len(), shortest(&square).len()), (5, 4));
-        let mut four = square.clone();
+        let mut four = square;
         four.add([1, 1], 1.0);
         assert_eq!((strip(&four).len(), shortest(&four).len()), (7, 7));
     }
