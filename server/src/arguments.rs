@@ -223,7 +223,7 @@ pub(super) struct ZoneArgs {
     /// The least height of the ground in the polygons, where the scene has none, as of water
     #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
     pub(super) level: Option<f64>,
-    /// What the errors of hidden ground count for: 0 to below 1
+    /// What the errors of hidden ground count for: 0 to 0.996
     #[arg(long, default_value_t = zone::HIDDEN, value_name = "SHARE", allow_negative_numbers = true)]
     pub(super) hidden: f64,
     /// The angle of a pixel: errors grow no larger than what hides them allows. 0: all that is hidden counts for

@@ -35,7 +35,8 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     ];
     let caption = "Orders of the bitree's triangles; 'full' is every sample of the grid";
     let mut table = Table::new("strips", caption, &columns);
-    let mut sums = vec![Vec::new(); run.options.tolerances.len()];
+    // The full grid first, then the tolerances.
+    let mut sums = vec![Vec::new(); run.options.tolerances.len() + 1];
     let steps = run.windows.len() * (run.options.tolerances.len() + 1);
     run.progress.stage("ordering", "meshes", steps as u64, 0);
     // Percent that the strip, the shortest and several save, by tolerance and window.
@@ -49,7 +50,7 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
             run.progress.advance(1);
             row
         };
-        push(["full".to_owned(), String::new()], &window.field.full_tree());
+        sums[0].push(push(["full".to_owned(), String::new()], &window.field.full_tree()).counts);
         for (i, percent) in run.options.tolerances.iter().enumerate() {
             if run.progress.is_stopping() {
                 return Err(ExperimentError::Stopped);
@@ -58,7 +59,7 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
             let (tree, strategy) = select(&ground, run.options.criterion, tolerance);
             let row = push([percent.to_string(), strategy.to_string()], &tree);
             saved.iter_mut().zip(row.saved).for_each(|(saved, one)| saved[i].push(one));
-            sums[i].push(row.counts);
+            sums[i + 1].push(row.counts);
         }
     }
     let line = |(name, saved): (&str, &Vec<Vec<f64>>)| {
@@ -77,7 +78,7 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     Ok(Report {
         title: "Triangle strips".to_owned(),
         notes: vec![format!(
-            "Separate triangles take three references each. The selection is {}, the better way by this criterion.",
+            "Separate triangles take three references each. The selection is {}, the default by this criterion.",
             run.options.criterion.strategy()
         )],
         tables: vec![means(run, &sums), table],
@@ -90,8 +91,9 @@ struct Row {
     cells: Vec<String>,
     /// Percent that the strip, the shortest and several save.
     saved: [f64; 3],
-    /// Triangles, line triangles, and references: separate, of the strip, of the shortest, of several.
-    counts: [usize; 6],
+    /// Triangles, line triangles; references: separate, of the strip, of the shortest, of several; how many these are; vertices
+    /// that a cache fetches for a triangle.
+    counts: [f64; 8],
 }
 
 fn row(tree: &Bitree) -> Row {
@@ -102,6 +104,7 @@ fn row(tree: &Bitree) -> Row {
     let references = several.iter().map(Vec::len).sum::<usize>() + several.len().saturating_sub(1);
     let separate = 3 * triangles.len();
     let lines = strip::line_triangles(&one);
+    let fetched = fetches(&triangles) as f64 / triangles.len() as f64;
     let saved = [one.len(), shortest, references].map(|n| 100.0 * (1.0 - n as f64 / separate as f64));
     let cells = vec![
         triangles.len().to_string(),
@@ -114,13 +117,15 @@ fn row(tree: &Bitree) -> Row {
         several.len().to_string(),
         references.to_string(),
         format!("{:.1}", saved[2]),
-        format!("{:.3}", fetches(&triangles) as f64 / triangles.len() as f64),
+        format!("{fetched:.3}"),
     ];
-    Row { cells, saved, counts: [triangles.len(), lines, separate, one.len(), shortest, references] }
+    let counts = [triangles.len(), lines, separate, one.len(), shortest, references, several.len()];
+    let [a, b, c, d, e, f, g] = counts.map(|count| count as f64);
+    Row { cells, saved, counts: [a, b, c, d, e, f, g, fetched] }
 }
 
 /// The windows' means by tolerance; and what strips save of all their references together, in which large meshes count for more.
-fn means(run: &Run<'_>, sums: &[Vec<[usize; 6]>]) -> Table {
+fn means(run: &Run<'_>, sums: &[Vec<[f64; 8]>]) -> Table {
     let columns = [
         "tolerance [%]",
         "windows",
@@ -130,21 +135,32 @@ fn means(run: &Run<'_>, sums: &[Vec<[usize; 6]>]) -> Table {
         "strip references",
         "saved by the strip: mean of windows [%]",
         "saved by the strip: of all references [%]",
+        "shortest strip's references",
         "saved by the shortest: mean of windows [%]",
         "saved by the shortest: of all references [%]",
+        "strips",
+        "strips' references",
         "saved by the strips: mean of windows [%]",
         "saved by the strips: of all references [%]",
+        "cached: fetches a triangle",
     ];
     let mut table = Table::new("means", "Means of the windows", &columns);
-    for (percent, list) in run.options.tolerances.iter().zip(sums) {
-        let mean = |i: usize| list.iter().map(|c| c[i] as f64).sum::<f64>() / list.len().max(1) as f64;
+    let tolerances = run.options.tolerances.iter().map(ToString::to_string);
+    for (label, list) in ["full".to_owned()].into_iter().chain(tolerances).zip(sums) {
+        let mean = |i: usize| list.iter().map(|c| c[i]).sum::<f64>() / list.len().max(1) as f64;
         let saved = |i: usize| {
-            let each = list.iter().map(|c| 100.0 * (1.0 - c[i] as f64 / c[2] as f64)).collect::<Vec<_>>();
+            let each = list.iter().map(|c| 100.0 * (1.0 - c[i] / c[2])).collect::<Vec<_>>();
             [mean_and_spread(&each)[0], 100.0 * (1.0 - mean(i) / mean(2))].map(|p| format!("{p:.1}"))
         };
-        let counts = [0, 1, 2, 3].map(|i| format!("{:.1}", mean(i)));
-        let head = [percent.to_string(), list.len().to_string()];
-        table.push(head.into_iter().chain(counts).chain([3, 4, 5].into_iter().flat_map(saved)));
+        let counts = |numbers: &[usize]| -> Vec<String> {
+            numbers.iter().map(|i| format!("{:.1}", mean(*i))).collect()
+        };
+        let mut row = vec![label, list.len().to_string()];
+        row.extend(counts(&[0, 1, 2, 3]).into_iter().chain(saved(3)));
+        row.extend(counts(&[4]).into_iter().chain(saved(4)));
+        row.extend(counts(&[6, 5]).into_iter().chain(saved(5)));
+        row.push(format!("{:.3}", mean(7)));
+        table.push(row);
     }
     table
 }

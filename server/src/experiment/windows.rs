@@ -233,7 +233,8 @@ fn weights(mask: &Source, at: Point, log2: u8) -> Result<Vec<f32>, ExperimentErr
     if low < 0.0 || high > 1.0 {
         return Err(ExperimentError::Options {
             option: "--mask",
-            expected: "weights from 0 to 1".to_owned(),
+            expected: "weights from 0 to 1 (of 0 to 255: gdal_translate -scale 0 255 0 1 -ot Float32)"
+                .to_owned(),
             found: format!("{low} to {high}"),
         });
     }

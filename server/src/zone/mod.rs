@@ -355,7 +355,11 @@ fn check(options: &Options) -> Result<(), ZoneError> {
         return wrong("--eye", eye, "metres above the ground, above 0 and at most a million");
     }
     if !(0.0..1.0).contains(hidden) || pack(*hidden) == u8::MAX {
-        return wrong("--hidden", hidden, "0 to below 1: what the errors of hidden ground count for");
+        return wrong(
+            "--hidden",
+            hidden,
+            "0 to 0.996: what the errors of hidden ground count for, in 255ths",
+        );
     }
     if !(0.0..=0.1).contains(angle) {
         return wrong("--angle", angle, "radians, 0 to 0.1");

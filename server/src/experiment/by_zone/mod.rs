@@ -39,7 +39,7 @@ pub(crate) struct Options {
     /// `zone`: what the polygon's numbers mean
     #[arg(long, value_enum, default_value_t = Coordinates::Auto)]
     pub(crate) coordinates: Coordinates,
-    /// `zone`: what the errors of hidden ground count for: 0 to below 1
+    /// `zone`: what the errors of hidden ground count for: 0 to 0.996
     #[arg(long, default_value_t = HIDDEN, value_name = "SHARE", allow_negative_numbers = true)]
     pub(crate) hidden: f64,
     /// `zone`: the angle of a pixel: what is hidden by less counts fully. 0: all that is hidden counts for --hidden
@@ -75,11 +75,11 @@ const COLUMNS: [&str; 17] = [
 
 pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     let Options { hidden, angle, epsilon, spacing, .. } = run.options.zone;
-    for (option, value, most) in
-        [("--hidden", hidden, 0.996), ("--angle", angle, 0.1), ("--epsilon", epsilon, 0.1)]
+    for (option, value, least, most) in
+        [("--hidden", hidden, 0.0, 0.996), ("--angle", angle, 0.0, 0.1), ("--epsilon", epsilon, 1e-6, 0.1)]
     {
-        if !(0.0..=most).contains(&value) {
-            let expected = format!("a number from 0 to {most}");
+        if !(least..=most).contains(&value) {
+            let expected = format!("a number from {least} to {most}");
             return Err(ExperimentError::Options { option, expected, found: value.to_string() });
         }
     }
@@ -114,8 +114,8 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     }
     notes.extend([
         format!(
-            "Eyes stand {} m above the highest ground of their polygon. Of each bitree's selections without the mask, \
-             from the top and greedy, the better is taken, and with the mask the same; criterion {:?}. Hidden ground counts for {hidden}, and for more \
+            "Eyes stand {} m above the highest ground of their polygon. Bitrees without and with the mask are selected in the same \
+             way, told beside each, the default by the criterion, {:?}. Hidden ground counts for {hidden}, and for more \
              where it is hidden by less than {angle} radians over that. A pixel is {ANGLE} radians.",
             run.options.eye,
             run.options.criterion,
