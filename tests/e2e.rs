@@ -39,6 +39,8 @@ mod limits;
 mod link;
 /// Many users at once.
 mod load;
+/// What water shows of the land around, in view or not.
+mod mirrors;
 /// Progressive streams: what any prefix is worth, who may ask for what, and the client that draws from one.
 mod progressive;
 /// Law 7: a build that was killed, stopped or ran out of disk goes on; the bytes are those of an unbroken one.

@@ -30,6 +30,17 @@ impl DrawItem {
     }
 }
 
+/// What a layer of water mirrors in a frame.
+#[derive(Debug, Clone)]
+pub struct Mirror {
+    /// Index of the layer of water in the scene.
+    pub layer: usize,
+    /// The height that it mirrors at, in metres, stretched as all heights are.
+    pub height: f64,
+    /// The triangles to draw; they cover whatever is in view in the mirror.
+    pub items: Vec<DrawItem>,
+}
+
 /// A motion at a moment.
 #[derive(Debug, Clone)]
 pub struct Moving {

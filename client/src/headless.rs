@@ -230,9 +230,11 @@ pub fn picture(
     let drawn = stretched(camera, look.exaggeration);
     terrain.set_exaggeration(look.exaggeration);
     terrain.set_wires(look.wireframe);
+    terrain.set_mirrors(look.mirrors().then_some(look.water.mirror_error));
     let view = terrain.settle(&drawn, patience);
     let layers = &terrain.scene().layers;
     offscreen.drape(view.drape.as_ref());
+    offscreen.mirror(&view.mirrors);
     offscreen.draw(layers, &drawn, &view.items, look)?;
     offscreen.read()?;
     // Everything is uploaded by now: this is what a frame costs.
@@ -630,6 +632,7 @@ pub fn fly(
     // Of a version of the scene.
     let mut annotator: Option<(String, Annotator)> = None;
     terrain.set_wires(look.wireframe);
+    terrain.set_mirrors(look.mirrors().then_some(look.water.mirror_error));
     let started = Instant::now();
     for frame in 0..flight.frames {
         if flight.frames_a_second > 0.0 {
@@ -653,6 +656,7 @@ pub fn fly(
         look.water.seconds += seconds;
         // Of this frame's version: another may have taken over, and lie elsewhere.
         offscreen.drape(view.drape.as_ref());
+        offscreen.mirror(&view.mirrors);
         let stats = offscreen.draw(&terrain.scene().layers, &drawn, &view.items, &look)?;
         if look.annotations.is_any() {
             let version = &terrain.scene().version;

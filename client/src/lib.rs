@@ -48,6 +48,7 @@ pub mod globe;
 pub mod headless;
 #[cfg(not(target_arch = "wasm32"))]
 pub mod load;
+pub mod mirror;
 pub mod morph;
 pub mod overview;
 pub mod pick;

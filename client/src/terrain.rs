@@ -16,6 +16,7 @@
 
 mod decoders;
 mod imagery;
+mod mirrors;
 mod options;
 mod reload;
 mod shares;
@@ -25,7 +26,7 @@ mod view;
 use crate::cache::{Cache, Index, Key};
 use crate::camera::{Camera, Plane};
 use crate::cut::{self, Ask, Drawing, Gpu, Ideal, Wish};
-use crate::drawing::DrawItem;
+use crate::drawing::{DrawItem, Mirror};
 use crate::encoding::Encoding;
 use crate::fetch::{self, Event, FetchError, Fetcher, ROOT_BYTES, Traffic, Want};
 use crate::morph::{self, Change, Moment, Morphs};
@@ -110,6 +111,8 @@ pub struct FrameView {
     /// The triangles to draw; together they cover whatever of the scene is in view, once all roots are
     /// there.
     pub items: Vec<DrawItem>,
+    /// What water mirrors, where [`Terrain::set_mirrors`] has asked for it.
+    pub mirrors: Vec<Mirror>,
     /// The imagery on them, once some of it is there.
     pub drape: Option<Drape>,
     /// The largest declared error of what is drawn, in pixels, as it looks from no nearer than the near plane;
@@ -164,6 +167,8 @@ pub struct Terrain {
     opened: Instant,
     /// Whether the lines around triangles are drawn, which take room on the GPU.
     wires: bool,
+    /// How many times the error what is mirrored may have, where it is asked for.
+    mirrors: Option<f64>,
     /// What the last frame saw; nothing before the first.
     planes: Option<[Plane; 5]>,
     stats: Stats,
@@ -175,6 +180,8 @@ pub struct Terrain {
 struct LayerState {
     index: Index,
     ideal: Ideal,
+    /// What is mirrored of it, for each layer of water.
+    mirrored: Vec<Ideal>,
     /// What the cut may take of the memory.
     memory_bytes: usize,
     /// What of it may be drawn, motions included, in bytes on the GPU.
@@ -232,6 +239,7 @@ impl Terrain {
         let state = |layer: &Layer| LayerState {
             index: Index::new(layer.forest),
             ideal: Ideal::default(),
+            mirrored: Vec::new(),
             memory_bytes: 0,
             gpu_bytes: 0,
             pages_max: 0,
@@ -267,6 +275,7 @@ impl Terrain {
             traffic_before: Traffic::default(),
             opened,
             wires: false,
+            mirrors: None,
             planes: None,
             stats: Stats::default(),
             view,
@@ -429,10 +438,12 @@ impl Terrain {
         let zone = self.view.as_ref().filter(|view| view.zone.contains(eye.to_array()));
         self.stats.zone_in_effect = zone.is_some();
         let tolerance = self.options.tolerance_pixels / camera.pixels_per_radian();
+        let [parts, own] = self.beside_mirrors();
         for (number, state) in self.layers.iter_mut().enumerate().filter(|(_, state)| state.shown) {
             let gpu_bytes_of = |d| self.cache.get((number, d)).map(|surface| surface.gpu_bytes(self.wires));
             // What moves is drawn beside what it becomes.
-            let gpu_bytes = if state.morphs.is_on() { state.gpu_bytes / 3 * 2 } else { state.gpu_bytes };
+            let gpu_bytes = state.gpu_bytes / parts as u64 * own as u64;
+            let gpu_bytes = if state.morphs.is_on() { gpu_bytes / 3 * 2 } else { gpu_bytes };
             let ask = Ask {
                 layer: &self.scene.layers[number],
                 encoding: self.options.fetch.encoding,
@@ -441,7 +452,7 @@ impl Terrain {
                 tolerance_pixels: self.options.tolerance_pixels,
                 sight: self.options.sight,
                 seen: zone.map(|zone| zone.seen(number, tolerance)),
-                memory_bytes: state.memory_bytes,
+                memory_bytes: state.memory_bytes / parts * own,
                 gpu: Some(Gpu { bytes: gpu_bytes, of: &gpu_bytes_of }),
             };
             state.ideal = cut::choose(&ask, |d| state.index.get(d));
@@ -459,12 +470,14 @@ impl Terrain {
             view.limited |= state.ideal.is_limited();
             view.complete &= drawing.wishes.is_empty() && state.ideal.pages().is_empty();
             wishes.extend(drawing.wishes.into_iter().map(|wish| (number, wish)));
-            state.index.trim(state.pages_max, state.ideal.seen());
+            let mirrored = state.mirrored.iter().flat_map(Ideal::seen);
+            state.index.trim(state.pages_max, state.ideal.seen().chain(mirrored));
         }
+        self.mirror(camera, &mut view, &mut wishes);
         self.planes = Some(camera.planes());
         self.judge_streams(&arrived);
         let layers = self.layers.iter().enumerate();
-        self.cache.want(layers.flat_map(|(number, state)| state.ideal.splits().map(move |d| (number, d))));
+        self.cache.want(layers.flat_map(|(number, state)| state.wanted().map(move |d| (number, d))));
         let imagery = self.imagery(camera, seconds, &mut view);
         self.wish(wishes, imagery);
         self.note(&view, started);
@@ -550,7 +563,7 @@ impl Terrain {
                     self.stats.points_fictitious += u64::from(tally.fictitious);
                     self.stats.points_corrected += u64::from(tally.corrected);
                     // What finds no room is wished for again when it is needed.
-                    self.cache.insert(key, surface, self.layers[number].ideal.contains(d));
+                    self.cache.insert(key, surface, self.layers[number].wants(d));
                 }
                 Err(error) => {
                     tracing::debug!(%error, centre = ?d.centre(), "payload refused");
@@ -626,7 +639,7 @@ impl Terrain {
 
     /// Asks for what the cut lacks: roots of all layers, pages, then payloads as they are urgent.
     fn wish(&mut self, mut wishes: Vec<(usize, Wish)>, imagery: Vec<Want>) {
-        for key in self.decoders.forget(|(number, d)| self.layers[number].ideal.contains(d)) {
+        for key in self.decoders.forget(|(number, d)| self.layers[number].wants(d)) {
             self.pending_bytes -= self.pending.remove(&key).unwrap_or(0);
         }
         if self.layers.len() > 1 {
@@ -641,9 +654,9 @@ impl Terrain {
             self.want((number, wish), &mut wants, &mut room);
         }
         for (number, state) in self.layers.iter().enumerate() {
-            wants.extend(
-                state.ideal.pages().iter().map(|p| Want { key: fetch::Key::Page(number, *p), bytes: None }),
-            );
+            let mirrored = state.mirrored.iter().flat_map(Ideal::pages);
+            let pages = state.ideal.pages().iter().chain(mirrored);
+            wants.extend(pages.map(|p| Want { key: fetch::Key::Page(number, *p), bytes: None }));
         }
         let pages_and_roots = wants.len();
         for wish in payloads {

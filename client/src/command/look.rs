@@ -64,6 +64,9 @@ pub(super) struct LookArgs {
     /// The size of the mirrored picture as a part of the picture's: less is faster, and blurred [default: 1]
     #[arg(long, value_name = "PART")]
     mirror_scale: Option<f64>,
+    /// How many times as large as --error-pixels errors may be in what water mirrors: more is faster [default: 2]
+    #[arg(long, value_name = "TIMES")]
+    mirror_error: Option<f64>,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -129,6 +132,9 @@ impl LookArgs {
         if let Some(scale) = self.mirror_scale.filter(|scale| !(*scale > 0.0 && *scale <= 1.0)) {
             return refuse(format!("--mirror-scale {scale}: expected a number above 0, at most 1"));
         }
+        if let Some(times) = self.mirror_error.filter(|times| !(1.0..=1000.0).contains(times)) {
+            return refuse(format!("--mirror-error {times}: expected a number from 1 to 1000"));
+        }
         if let Some([low, high]) = self.range.filter(|[low, high]| low >= high) {
             return refuse(format!("--range {low},{high}: expected the lower end first"));
         }
@@ -160,6 +166,7 @@ impl LookArgs {
             (self.waves.is_some(), "--waves", "water has one colour"),
             (self.clarity.is_some(), "--clarity", "water has one colour"),
             (self.mirror_scale.is_some(), "--mirror-scale", "water has one colour"),
+            (self.mirror_error.is_some(), "--mirror-error", "water has one colour"),
         ];
         let wrong = wrong.into_iter().filter(|_| self.is_true).find(|(is_asked, ..)| *is_asked);
         wrong.map_or(Ok(()), |(_, option, why)| Err(untrue(option, why)))
@@ -202,6 +209,7 @@ impl LookArgs {
                 waves: self.waves.unwrap_or(look.water.waves),
                 clarity: self.clarity,
                 mirror_scale: self.mirror_scale.unwrap_or(look.water.mirror_scale),
+                mirror_error: self.mirror_error.unwrap_or(look.water.mirror_error),
                 ..look.water
             },
             ..look

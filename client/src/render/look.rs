@@ -56,6 +56,12 @@ impl Default for Look {
 const PAPER: Background = Background::Colour([1.0; 4]);
 
 impl Look {
+    /// Whether layers of water mirror what is around them.
+    #[must_use]
+    pub fn mirrors(&self) -> bool {
+        self.water.reflecting && !self.wireframe
+    }
+
     /// How a scene looks unless told otherwise: other bodies than the Earth are grey, without air, and the sun
     /// stands low, as plains of dust show little relief else.
     #[must_use]
@@ -217,6 +223,8 @@ pub struct Water {
     pub clarity: Option<f64>,
     /// Width and height of the mirrored picture as parts of those of the picture; above 0, at most 1.
     pub mirror_scale: f64,
+    /// How many times as large as in the picture itself errors may be in what is mirrored; at least 1.
+    pub mirror_error: f64,
 }
 
 impl Default for Water {
@@ -229,6 +237,7 @@ impl Default for Water {
             seconds: 0.0,
             clarity: None,
             mirror_scale: 1.0,
+            mirror_error: 2.0,
         }
     }
 }

@@ -40,7 +40,7 @@ pub(crate) use overlay::Overlay;
 pub use ramp::{Quantity, Scale, water_colour};
 
 use crate::camera::{Bounds, Camera, nearest_drawn};
-use crate::drawing::DrawItem;
+use crate::drawing::{DrawItem, Mirror};
 use crate::surface::Surface;
 use crate::texture::Drape;
 use diamantina_protocol::message::{self, Layer};
@@ -227,6 +227,7 @@ pub struct Renderer {
     groups: [wgpu::BindGroupLayout; 2],
     sky: wgpu::RenderPipeline,
     drapes: Drapes,
+    mirrors: Vec<Mirror>,
     /// Bytes of imagery uploaded since the last frame.
     draped_bytes: u64,
     /// There but while a frame is drawn.
@@ -286,6 +287,7 @@ impl Renderer {
                 Mode::Filled,
             ),
             drapes,
+            mirrors: Vec::new(),
             draped_bytes: 0,
             wires: None,
             sky: sky_pipeline(&device, target, &groups[0]),
@@ -323,7 +325,10 @@ impl Renderer {
         look: &Look,
         target: &wgpu::TextureView,
     ) -> FrameStats {
-        let uploaded_bytes = self.residents.start_frame(&self.device, layers, items, look.wireframe);
+        let mirrors = if look.mirrors() { self.mirrors.as_slice() } else { &[] };
+        let mirrored = mirrors.iter().flat_map(|mirror| &mirror.items);
+        let uploaded_bytes =
+            self.residents.start_frame(&self.device, layers, items, mirrored, look.wireframe);
         let mut stats =
             FrameStats { uploaded_bytes, gpu_bytes: self.residents.bytes(), ..Default::default() };
         stats.uploaded_bytes += std::mem::take(&mut self.draped_bytes);
@@ -388,6 +393,11 @@ impl Renderer {
         drape::reads_blocks(&self.device)
     }
 
+    /// Says what layers of water mirror in the next frames. Those that nothing is said of mirror what is drawn.
+    pub fn mirror(&mut self, mirrors: &[Mirror]) {
+        self.mirrors = mirrors.to_vec();
+    }
+
     /// Lays imagery on the terrain in the frames from now on, or none: uploads tiles not seen before.
     pub fn drape(&mut self, drape: Option<&Drape>) {
         self.draped_bytes += self.drapes.show(&self.device, &self.queue, drape);
@@ -427,7 +437,10 @@ impl Renderer {
                 let shares_triangles = resident.own.is_none();
                 let kind = match &*item.surface {
                     Surface::Tin(_) => Kind::Corners,
-                    Surface::Points(_) if resident.motion.is_some() => Kind::MovingPoints,
+                    // What is mirrored stands still while it moves in the picture.
+                    Surface::Points(_) if item.moving.is_some() && resident.motion.is_some() => {
+                        Kind::MovingPoints
+                    }
                     Surface::Points(_) => Kind::Points,
                 };
                 Some(Draw { item, sides, shares_triangles, kind, bounds, distance })
@@ -505,7 +518,7 @@ impl Renderer {
 /// Whether an item is drawn as water, by passes of its own.
 fn is_water(layers: &[Layer], item: &DrawItem, look: &Look) -> bool {
     let is_water = layers.get(item.layer).is_some_and(|layer| layer.kind == message::Kind::Water);
-    is_water && look.water.reflecting && !look.wireframe
+    is_water && look.mirrors()
 }
 
 impl Lens {

@@ -2,7 +2,7 @@
 
 use super::{BACKENDS, FrameStats, Look, Options, Overlay, RenderError, Renderer, device, fit, instance};
 use crate::camera::Camera;
-use crate::drawing::DrawItem;
+use crate::drawing::{DrawItem, Mirror};
 use crate::picture::Picture;
 use crate::texture::Drape;
 use diamantina_protocol::message::Layer;
@@ -35,6 +35,11 @@ impl Offscreen {
     /// See [`Renderer::drape`].
     pub fn drape(&mut self, drape: Option<&Drape>) {
         self.renderer.drape(drape);
+    }
+
+    /// See [`Renderer::mirror`].
+    pub fn mirror(&mut self, mirrors: &[Mirror]) {
+        self.renderer.mirror(mirrors);
     }
 
     /// See [`Renderer::reads_blocks`].

@@ -105,18 +105,20 @@ impl Residents {
         self.by_form.get(&Form::of(item.surface.points()?.block()))
     }
 
-    /// Starts a frame that draws these items: uploads those that are not there yet, and drops others if
+    /// Starts a frame that draws these items, and these at rest in mirrors: uploads those that are not there yet, and drops others if
     /// they exceed the budget. Returns the bytes uploaded. Items of unknown layers are passed over.
-    pub(super) fn start_frame(
+    pub(super) fn start_frame<'a>(
         &mut self,
         device: &wgpu::Device,
         layers: &[Layer],
-        items: &[DrawItem],
+        items: &'a [DrawItem],
+        mirrored: impl Iterator<Item = &'a DrawItem> + Clone,
         wires: bool,
     ) -> u64 {
         self.frame += 1;
         let mut coming_bytes = 0;
-        for item in items {
+        let all = items.iter().map(|item| (item, true)).chain(mirrored.map(|item| (item, false)));
+        for (item, _) in all.clone() {
             match self.by_key.get_mut(&(item.layer, item.diamond)) {
                 Some(resident) => resident.last_frame = self.frame,
                 None => coming_bytes += item.gpu_bytes(wires),
@@ -124,7 +126,7 @@ impl Residents {
         }
         self.shrink(self.budget_bytes.saturating_sub(coming_bytes));
         let mut uploaded_bytes = 0;
-        for item in items {
+        for (item, moves) in all {
             let Some(layer) = layers.get(item.layer) else { continue };
             if let Some(points) = item.surface.points() {
                 let form = Form::of(points.block());
@@ -144,7 +146,9 @@ impl Residents {
             {
                 resident.last_frame = self.frame;
                 let old_bytes = resident.bytes;
-                uploaded_bytes += resident.move_as(device, item);
+                if moves {
+                    uploaded_bytes += resident.move_as(device, item);
+                }
                 self.bytes = self.bytes + resident.bytes - old_bytes;
                 continue;
             }

@@ -50,6 +50,7 @@ const PLAIN: Look = Look {
         seconds: 0.0,
         clarity: None,
         mirror_scale: 1.0,
+        mirror_error: 1.0,
     },
     imagery: Imagery { light: 0.0, opacity: 1.0 },
     annotations: Annotations { scale_bar: false, north_arrow: false, legend: false },

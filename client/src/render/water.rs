@@ -6,8 +6,8 @@
 //! Schlick's R(t) = R0 + (1 - R0) (1 - cos t)^5 and R0 = ((n - 1) / (n + 1))^2. See `shaders/water.wgsl`.
 //!
 //! Each layer of water has one plane, at the mean height of what is in view of it, near parts counting most. Its own
-//! slopes and the waves bend the rays at each pixel. The mirrored picture is drawn from the same diamonds as the picture:
-//! what is out of the picture's view is coarser than its mirror image would ask for.
+//! slopes and the waves bend the rays at each pixel. The mirrored picture is drawn from a cut of its own, where there is
+//! one (see [`Renderer::mirror`]), else from the diamonds of the picture.
 
 use super::frame::single;
 use super::pipelines::{Mode, Pipelines, Target, sky_pipeline, terrain_pipelines};
@@ -15,6 +15,7 @@ use super::view::View;
 use super::{DEPTH, Draw, FrameStats, Lens, Look, Renderer, clear_colour, is_water};
 use crate::camera::Camera;
 use crate::drawing::DrawItem;
+use crate::mirror::mean_height;
 use diamantina_protocol::message::Layer;
 use glam::{DVec2, DVec3};
 use std::collections::BTreeMap;
@@ -258,12 +259,16 @@ impl WaterPasses {
             let Some(mirror) = self.mirrors.get_mut(&number) else { continue };
             let uniform = WaterUniform::new(layer, look, camera.eye, near);
             renderer.queue.write_buffer(&mirror.uniform, 0, bytemuck::bytes_of(&uniform));
-            let height = mean_height(&draws, camera.eye);
+            let told = renderer.mirrors.iter().find(|mirror| mirror.layer == number);
+            let drawn = draws.iter().map(|draw| (draw.item.diamond, draw.bounds));
+            let height = told.map(|told| told.height).or_else(|| mean_height(drawn, camera.eye));
+            let Some(height) = height else { continue };
             if camera.eye.z <= height {
                 // Nothing is mirrored on the way up.
                 continue;
             }
             let view = View::mirrored(camera, height);
+            let items = told.map_or(items, |told| &told.items);
             let land = renderer.in_view(layers, &view, items, look, is_land);
             mirror.lens.write(renderer, layers, &view, look, &land, false);
             draw_sheet(
@@ -362,22 +367,4 @@ fn draw_sheet(
     pass.set_bind_group(2, renderer.drapes.group(), &[]);
     renderer.draw_surfaces(&mut pass, lens, land, 0, pipelines, false, stats);
     lens.draw_sky(&mut pass, sky, look);
-}
-
-/// The mean height of what is in view, in metres, stretched: each part counts as large as it looks.
-fn mean_height(draws: &[&Draw<'_>], eye: DVec3) -> f64 {
-    let mut parts: Vec<_> = draws
-        .iter()
-        .map(|draw| {
-            let size = draw.bounds.max - draw.bounds.min;
-            let distance = draw.bounds.distance(eye).max(size.truncate().length()).max(1e-9);
-            let weight = (size.x * size.y).max(1e-9) / (distance * distance);
-            (draw.item.diamond, weight, draw.bounds.min.z.midpoint(draw.bounds.max.z))
-        })
-        .collect();
-    // Sums depend on the order, if only in their last bits: the same view is the same picture.
-    parts.sort_unstable_by_key(|(diamond, ..)| *diamond);
-    let (sum, weights) =
-        parts.iter().fold((0.0, 0.0), |(sum, weights), (_, w, height)| (sum + w * height, weights + w));
-    sum / weights
 }

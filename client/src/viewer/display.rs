@@ -145,6 +145,7 @@ impl Display {
             let view = texture.texture.create_view(&wgpu::TextureViewDescriptor::default());
             let layers = &viewer.terrain().scene().layers;
             self.renderer.drape(viewer.drape());
+            self.renderer.mirror(viewer.mirrors());
             let drawn = self.renderer.draw(layers, viewer.camera(), &viewer.items(), viewer.look(), &view);
             let size = [self.configuration.width, self.configuration.height];
             self.overlay.paint(self.renderer.device(), self.renderer.queue(), &view, size, &shapes);

@@ -31,7 +31,7 @@ pub use measure::Mark;
 use crate::annotate::{self, Subject};
 use crate::camera::Camera;
 use crate::controls::{self, Controls, Thrust};
-use crate::drawing::DrawItem;
+use crate::drawing::{DrawItem, Mirror};
 use crate::globe::Globe;
 use crate::overview;
 use crate::pick::{Hit, Picker, Ray};
@@ -192,6 +192,12 @@ impl Viewer {
         items.iter().filter(|item| self.terrain.is_shown(item.layer)).cloned().collect()
     }
 
+    /// What water mirrors; where the cut is frozen, that is drawn.
+    #[must_use]
+    pub fn mirrors(&self) -> &[Mirror] {
+        if self.frozen.is_some() { &[] } else { &self.frame.mirrors }
+    }
+
     /// The imagery on what is drawn.
     #[must_use]
     pub fn drape(&self) -> Option<&Drape> {
@@ -273,6 +279,7 @@ impl Viewer {
         }
         let (reloads, is_replaced) = (self.frame.stats.reloads, self.terrain.scene_changed());
         self.terrain.set_wires(self.look.wireframe);
+        self.terrain.set_mirrors(self.look.mirrors().then_some(self.look.water.mirror_error));
         self.frame = self.terrain.frame(self.controls.camera());
         if self.frame.stats.reloads != reloads {
             // Of whatever encoding, its surfaces are the frame's before.

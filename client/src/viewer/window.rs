@@ -102,6 +102,7 @@ impl Shown {
         let mut offscreen = Offscreen::new(&render::Options { samples, ..self.options })?;
         let layers = &self.viewer.terrain().scene().layers;
         offscreen.drape(self.viewer.drape());
+        offscreen.mirror(self.viewer.mirrors());
         offscreen.draw(layers, self.viewer.camera(), &self.viewer.items(), self.viewer.look())?;
         let size = self.viewer.camera().size;
         if self.viewer.look().annotations.is_any() {
