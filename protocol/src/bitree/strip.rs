@@ -334,7 +334,7 @@ mod tests {
         assert_eq!((strip(&four).len(), shortest(&four).len()), (7, 7));
         // Six around a centre, on two of whose outer sides a point lies: nine, found by trying all strips.
         let mut six = Bitree::new(1, [0.0; 4]).unwrap();
-        for p in [[1, 2], [2, 1], [1, 1]] {
+        for p in [[1, 2], [0, 1], [1, 1]] {
             six.add(p, 1.0);
         }
         assert_eq!((six.triangle_count(), shortest(&six).len()), (6, 9));
