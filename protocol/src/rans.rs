@@ -87,6 +87,12 @@ pub struct Encoder {
 }
 
 impl Encoder {
+    /// An encoder that has room for so many symbols before it grows.
+    #[must_use]
+    pub fn with_capacity(symbols: usize) -> Self {
+        Self { steps: Vec::with_capacity(symbols) }
+    }
+
     /// Appends a symbol that takes the probabilities `start..start + share` of [`TOTAL`]; share above 0.
     pub fn symbol(&mut self, lane: u8, start: u16, share: u16) {
         self.steps.push(Step { start, share, bits: 0, lane });

@@ -7,15 +7,22 @@
 use super::walk::{Beyond, NONE, Point, Seed, Square, Within, cross};
 use super::{Patch, PatchError, TRIANGLES_MAX};
 
-/// A triangle's corner: three times its number, and 0 to 2.
+/// A triangle's corner: four times its number, and 0 to 2. So no number needs a division; every fourth is none.
 type Corner = u32;
 
+const STRIDE: usize = 4;
+
 fn next(corner: Corner) -> Corner {
-    if corner % 3 == 2 { corner - 2 } else { corner + 1 }
+    if corner & 3 == 2 { corner - 2 } else { corner + 1 }
 }
 
 fn prev(corner: Corner) -> Corner {
-    next(next(corner))
+    if corner & 3 == 0 { corner + 2 } else { corner - 1 }
+}
+
+/// The corners of so many triangles.
+fn corners(triangles: usize) -> impl Iterator<Item = Corner> {
+    (0..index(STRIDE * triangles)).filter(|corner| corner & 3 != 3)
 }
 
 /// A mesh to be sent. Gates are marked with the corner of the triangle beyond where the gate starts, or [`NONE`].
@@ -45,12 +52,12 @@ impl Mesh {
         let within: Vec<Within> =
             points.iter().map(|p| square.within(i64::from(p.x), i64::from(p.y))).collect();
         check(patch, points, &within)?;
-        let vertices: Vec<u32> = patch.triangles.iter().flatten().copied().collect();
-        let across = across(&vertices, points.len())?;
-        let (fans, places) = fans(&vertices, &across, points);
-        let outer = |corner: Corner| within[vertices[corner as usize] as usize].outer;
+        let across = across(&patch.triangles, points.len())?;
+        let vertex = |corner: Corner| patch.triangles[corner as usize / STRIDE][corner as usize % STRIDE];
+        let (fans, places) = fans(&patch.triangles, &across, points);
+        let outer = |corner: Corner| within[vertex(corner) as usize].outer;
         let is_inner = |corner: Corner| outer(corner) & outer(next(corner)) == 0;
-        let holes = (0..index(across.len())).any(|c| across[c as usize] == NONE && is_inner(c));
+        let holes = corners(patch.triangles.len()).any(|c| across[c as usize] == NONE && is_inner(c));
         Ok(Self {
             across,
             names: vec![NONE; places.len()],
@@ -73,7 +80,7 @@ impl Mesh {
         while *self.met.get(self.first)? {
             self.first += 1;
         }
-        let corner = index(3 * self.first);
+        let corner = index(STRIDE * self.first);
         let points = [corner, corner + 1].map(|corner| {
             let fan = self.fans[corner as usize] as usize;
             self.names[fan] = self.named;
@@ -88,7 +95,7 @@ impl Mesh {
         if mark == NONE {
             return Beyond::Nothing;
         }
-        self.met[mark as usize / 3] = true;
+        self.met[mark as usize / STRIDE] = true;
         let fan = self.fans[prev(mark) as usize] as usize;
         match self.names[fan] {
             NONE => {
@@ -107,31 +114,35 @@ impl Mesh {
 }
 
 /// For each corner the one across the edge to the next corner, where the neighbour's edge starts.
-fn across(vertices: &[u32], count: usize) -> Result<Vec<Corner>, PatchError> {
-    // The corners of each vertex, with where their edges end.
-    let mut starts = vec![0u32; count + 1];
-    for v in vertices {
-        starts[*v as usize + 1] += 1;
+fn across(triangles: &[[u32; 3]], count: usize) -> Result<Vec<Corner>, PatchError> {
+    // The corners of each vertex, with where their edges end. One place too far to begin with: filling the list
+    // moves each to where it belongs.
+    let mut starts = vec![0u32; count + 2];
+    for v in triangles.as_flattened() {
+        starts[*v as usize + 2] += 1;
     }
-    for i in 0..count {
-        starts[i + 1] += starts[i];
+    let mut sum = 0;
+    for start in &mut starts {
+        sum += *start;
+        *start = sum;
     }
-    let mut at = starts.clone();
-    let mut edges = vec![(0, 0); vertices.len()];
-    for (corner, v) in (0..).zip(vertices) {
-        let slot = &mut at[*v as usize];
-        edges[*slot as usize] = (vertices[next(corner) as usize], corner);
-        *slot += 1;
+    let mut edges = vec![[0u32; 2]; 3 * triangles.len()];
+    for (t, [a, b, c]) in (0..).step_by(STRIDE).zip(triangles) {
+        for (corner, from, to) in [(t, a, b), (t + 1, b, c), (t + 2, c, a)] {
+            let slot = &mut starts[*from as usize + 1];
+            edges[*slot as usize] = [*to, corner];
+            *slot += 1;
+        }
     }
     let edges_of = |v: u32| &edges[starts[v as usize] as usize..starts[v as usize + 1] as usize];
-    let mut across = vec![NONE; vertices.len()];
+    let mut across = vec![NONE; STRIDE * triangles.len()];
     for (a, list) in (0..index(count)).map(|a| (a, edges_of(a))) {
-        for (i, (b, corner)) in list.iter().enumerate() {
-            if list[..i].iter().any(|(other, _)| other == b) {
+        for (i, [b, corner]) in list.iter().enumerate() {
+            if list[..i].iter().any(|[other, _]| other == b) {
                 return Err(PatchError::Edge(a, *b));
             }
             if *b > a
-                && let Some((_, twin)) = edges_of(*b).iter().find(|(end, _)| *end == a)
+                && let Some([_, twin]) = edges_of(*b).iter().find(|[end, _]| *end == a)
             {
                 across[*corner as usize] = *twin;
                 across[*twin as usize] = *corner;
@@ -149,15 +160,16 @@ fn check(patch: &Patch, points: &[Point], within: &[Within]) -> Result<(), Patch
     }
     for child in 0..4 {
         for triangle in &patch.triangles[patch.range(child)] {
-            if triangle.iter().any(|v| *v as usize >= points.len()) {
+            let point = |v: u32| points.get(v as usize).copied();
+            let [a, b, c] = *triangle;
+            let (Some(p), Some(q), Some(r)) = (point(a), point(b), point(c)) else {
                 return Err(PatchError::Vertex(*triangle));
-            }
-            let [a, b, c] = triangle.map(|v| points[v as usize]);
-            if cross(a, b, c) <= 0 {
+            };
+            if cross(p, q, r) <= 0 {
                 return Err(PatchError::Turn(*triangle));
             }
-            let inside = triangle.map(|v| within[v as usize].children);
-            if inside[0] & inside[1] & inside[2] & 1 << child == 0 {
+            let inside = |v: u32| within[v as usize].children;
+            if inside(a) & inside(b) & inside(c) & 1 << child == 0 {
                 return Err(PatchError::Child(*triangle, child));
             }
         }
@@ -166,15 +178,15 @@ fn check(patch: &Patch, points: &[Point], within: &[Within]) -> Result<(), Patch
 }
 
 /// The fan of each corner, and the place of each fan.
-fn fans(vertices: &[u32], across: &[Corner], points: &[Point]) -> (Vec<u32>, Vec<Point>) {
-    let mut fans = vec![NONE; vertices.len()];
+fn fans(triangles: &[[u32; 3]], across: &[Corner], points: &[Point]) -> (Vec<u32>, Vec<Point>) {
+    let mut fans = vec![NONE; across.len()];
     let mut places = Vec::with_capacity(points.len());
-    for corner in 0..index(vertices.len()) {
+    for (corner, vertex) in corners(triangles.len()).zip(triangles.as_flattened()) {
         if fans[corner as usize] != NONE {
             continue;
         }
         let fan = index(places.len());
-        places.push(points[vertices[corner as usize] as usize]);
+        places.push(points[*vertex as usize]);
         // To the left around the vertex, and if that does not come back, to the right.
         let mut at = corner;
         while at != NONE && fans[at as usize] == NONE {

@@ -192,33 +192,45 @@ pub fn encode(forest: &Forest, d: Diamond, patch: &Patch) -> Result<Vec<u8>, Pat
             Err(PatchError::Vertex(patch.triangles[0]))
         };
     };
-    let used = || patch.triangles.iter().flatten().filter_map(|v| patch.vertices.get(*v as usize));
-    if let Some(bad) = used().find(|v| v.height.unsigned_abs() > HEIGHT_MAX.unsigned_abs()) {
-        return Err(PatchError::Height(bad.height));
+    let mut is_used = vec![false; patch.vertices.len()];
+    for v in patch.triangles.as_flattened() {
+        if let Some(is_used) = is_used.get_mut(*v as usize) {
+            *is_used = true;
+        }
     }
     let centre = d.centre();
-    let all = used().fold(0, |all, v| all | (v.x ^ centre[0]) | (v.y ^ centre[1]));
     let base = i64::from(first.height);
-    let step = used().fold(0, |step, v| gcd(step, i64::from(v.height) - base)).max(1);
+    let (mut all, mut step) = (0, 0);
+    for (v, _) in patch.vertices.iter().zip(&is_used).filter(|(_, is_used)| **is_used) {
+        if v.height.unsigned_abs() > HEIGHT_MAX.unsigned_abs() {
+            return Err(PatchError::Height(v.height));
+        }
+        all |= (v.x ^ centre[0]) | (v.y ^ centre[1]);
+        // Nothing divides it further.
+        if step != 1 {
+            step = gcd(step, i64::from(v.height) - base);
+        }
+    }
+    let step = step.max(1);
     let units = Units { shift: all.trailing_zeros().min(31), base, step };
-    let points: Vec<Point> = patch
-        .vertices
-        .iter()
-        .map(|v| {
-            // Vertices that no triangle uses may lie anywhere, and then they are not told.
-            let narrow = |value: i64| i32::try_from(value).unwrap_or(i32::MAX);
-            Point {
-                x: narrow((i64::from(v.x) - i64::from(centre[0])) >> units.shift),
-                y: narrow((i64::from(v.y) - i64::from(centre[1])) >> units.shift),
-                height: narrow((i64::from(v.height) - base) / step),
-            }
-        })
-        .collect();
+    // Vertices that no triangle uses may lie anywhere, and then they are not told.
+    let narrow = |value: i64| i32::try_from(value).unwrap_or(i32::MAX);
+    let point = |v: &Vertex| {
+        let height = i64::from(v.height) - base;
+        Point {
+            x: narrow((i64::from(v.x) - i64::from(centre[0])) >> units.shift),
+            y: narrow((i64::from(v.y) - i64::from(centre[1])) >> units.shift),
+            height: narrow(if step == 1 { height } else { height / step }),
+        }
+    };
+    let points: Vec<Point> = patch.vertices.iter().map(point).collect();
     let square = Square::new(forest, d, units.shift);
     let mesh = Mesh::new(patch, &points, &square)?;
     let holes = mesh.has_holes();
-    let mut sender = Sender { coder: Encoder::default(), tables: numbers::tables(), mesh };
     let expected = patch.triangles.len();
+    // Two bits or three a triangle, and three numbers a vertex.
+    let coder = Encoder::with_capacity(5 * expected);
+    let mut sender = Sender { coder, tables: numbers::tables(), mesh };
     let passed = units.pass(&mut sender).and_then(|_| Walk::new(square, holes, expected).run(&mut sender));
     passed.map_err(|fault| if fault == Fault::Size { PatchError::Vertices } else { PatchError::Overlap })?;
     let two_lanes = patch.triangles.len() >= TWO_LANES_TRIANGLES;
@@ -304,10 +316,7 @@ fn gather(walk: &Walk, units: Units, d: Diamond) -> Result<Patch, DecodeError> {
     if odd & 1 == 0 || (divisor != 1 && (divisor != 0 || units.step != 1)) {
         return Err(DecodeError::Symbols);
     }
-    let mut counts = [0u32; 4];
-    for (_, child) in walk.triangles() {
-        counts[usize::from(child)] += 1;
-    }
+    let counts = walk.counts();
     let mut ends = counts;
     for child in 1..4 {
         ends[child] += ends[child - 1];
@@ -315,7 +324,7 @@ fn gather(walk: &Walk, units: Units, d: Diamond) -> Result<Patch, DecodeError> {
     let mut at: [u32; 4] = std::array::from_fn(|child| ends[child] - counts[child]);
     let mut triangles = vec![[0; 3]; walk.triangles().len()];
     for (triangle, child) in walk.triangles() {
-        let slot = &mut at[usize::from(child)];
+        let slot = &mut at[usize::from(child % 4)];
         triangles[*slot as usize] = triangle;
         *slot += 1;
     }

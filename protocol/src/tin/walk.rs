@@ -247,8 +247,9 @@ pub(super) struct Walk {
     places: Vec<Placed>,
     gates: Vec<Gate>,
     triangles: Vec<[u32; 3]>,
-    /// The child triangle of each triangle.
+    /// The child triangle of each triangle, and how many each has.
     children: Vec<u8>,
+    counts: [u32; 4],
     /// Inner borders found.
     borders: usize,
     contexts: Contexts,
@@ -296,6 +297,7 @@ impl Walk {
             gates: Vec::with_capacity(expected * 7 / 4),
             triangles: Vec::with_capacity(expected),
             children: Vec::with_capacity(expected),
+            counts: [0; 4],
             borders: 0,
             contexts: Contexts::new(square.half),
             square,
@@ -310,6 +312,11 @@ impl Walk {
     /// The triangles, in the order in which they were met, with the child triangle of each.
     pub(super) fn triangles(&self) -> impl ExactSizeIterator<Item = ([u32; 3], u8)> + '_ {
         self.triangles.iter().copied().zip(self.children.iter().copied())
+    }
+
+    /// How many triangles each child triangle has.
+    pub(super) fn counts(&self) -> [u32; 4] {
+        self.counts
     }
 
     /// Walks over a whole mesh.
@@ -364,8 +371,9 @@ impl Walk {
         }
         // Two gates, one on each side of the edge. The first has a triangle for sure.
         let gate = index(self.gates.len());
-        self.push([index(first), index(first + 1)], [gate + 1; 2], NONE, seed.marks[0]);
-        self.push([index(first + 1), index(first)], [gate; 2], index(first + 2), seed.marks[1]);
+        let outer = self.places[first].within.outer & self.places[first + 1].within.outer;
+        self.push(index(first), outer, [gate + 1; 2], NONE, seed.marks[0]);
+        self.push(index(first + 1), outer, [gate; 2], index(first + 2), seed.marks[1]);
         let beyond = pass.beyond(seed.marks[0]);
         self.grow(pass, &self.here(gate as usize), beyond)
     }
@@ -387,10 +395,10 @@ impl Walk {
         Ok(placed)
     }
 
-    /// A new gate between two vertices and two gates.
+    /// A new gate that begins at a vertex, between two gates; with the lines of the square's border on which both of its
+    /// ends lie.
     #[inline(always)]
-    fn push(&mut self, [origin, end]: [u32; 2], [prev, next]: [u32; 2], behind: u32, mark: u32) -> u32 {
-        let outer = self.places[origin as usize].within.outer & self.places[end as usize].within.outer;
+    fn push(&mut self, origin: u32, outer: u8, [prev, next]: [u32; 2], behind: u32, mark: u32) -> u32 {
         let state = if outer == 0 { State::Open } else { State::Border };
         let number = index(self.gates.len());
         self.gates.push(Gate { origin, prev, next, behind, mark, state });
@@ -460,7 +468,9 @@ impl Walk {
         }
         self.triangles.push([here.gate.origin, here.next.origin, v]);
         // Closed child triangles share lines only, so there is one bit.
-        self.children.push(within.trailing_zeros() as u8);
+        let child = within.trailing_zeros() as u8;
+        self.children.push(child);
+        self.counts[usize::from(child % 4)] += 1;
         self.gates[here.at].state = State::Done;
         Ok(())
     }
@@ -493,8 +503,9 @@ impl Walk {
         self.triangle(here, v, &placed)?;
         let Gate { origin, prev, next, mark, .. } = here.gate;
         let marks = pass.marks(mark);
-        let to = self.push([origin, v], [prev, NONE], here.next.origin, marks[0]);
-        let from = self.push([v, here.next.origin], [to, next], origin, marks[1]);
+        let outer = placed.within.outer;
+        let to = self.push(origin, here.a.within.outer & outer, [prev, NONE], here.next.origin, marks[0]);
+        let from = self.push(v, here.b.within.outer & outer, [to, next], origin, marks[1]);
         self.gates[to as usize].next = from;
         self.gates[prev as usize].next = to;
         self.gates[next as usize].prev = from;
@@ -504,7 +515,7 @@ impl Walk {
     /// A triangle with the start of the gate before.
     #[inline(always)]
     fn join_left(&mut self, pass: &impl Pass, here: &Here) -> Result<(), Fault> {
-        let Here { gate, prev, next, before: apex, .. } = *here;
+        let Here { gate, prev, before: apex, .. } = *here;
         let (v, closes) = (prev.origin, prev.prev == gate.next);
         if !closes {
             let before = self.point(self.gate(prev.prev).origin);
@@ -519,7 +530,8 @@ impl Walk {
             self.gates[gate.next as usize].state = State::Done;
             return Ok(());
         }
-        let from = self.push([v, next.origin], [prev.prev, gate.next], gate.origin, pass.marks(gate.mark)[1]);
+        let outer = apex.within.outer & here.b.within.outer;
+        let from = self.push(v, outer, [prev.prev, gate.next], gate.origin, pass.marks(gate.mark)[1]);
         self.gates[prev.prev as usize].next = from;
         self.gates[gate.next as usize].prev = from;
         Ok(())
@@ -537,8 +549,9 @@ impl Walk {
         }
         self.triangle(here, beyond.origin, &apex)?;
         self.gates[gate.next as usize].state = State::Done;
-        let ends = [gate.origin, beyond.origin];
-        let to = self.push(ends, [gate.prev, next.next], next.origin, pass.marks(gate.mark)[0]);
+        let outer = here.a.within.outer & apex.within.outer;
+        let links = [gate.prev, next.next];
+        let to = self.push(gate.origin, outer, links, next.origin, pass.marks(gate.mark)[0]);
         self.gates[gate.prev as usize].next = to;
         self.gates[next.next as usize].prev = to;
         Ok(())
@@ -612,8 +625,9 @@ impl Walk {
         self.triangle(here, v, &apex)?;
         let Gate { origin, prev, next, mark, .. } = here.gate;
         let marks = pass.marks(mark);
-        let to = self.push([origin, v], [prev, out], here.next.origin, marks[0]);
-        let from = self.push([v, here.next.origin], [incoming, next], origin, marks[1]);
+        let outer = apex.within.outer;
+        let to = self.push(origin, here.a.within.outer & outer, [prev, out], here.next.origin, marks[0]);
+        let from = self.push(v, here.b.within.outer & outer, [incoming, next], origin, marks[1]);
         self.gates[prev as usize].next = to;
         self.gates[out as usize].prev = to;
         self.gates[incoming as usize].next = from;

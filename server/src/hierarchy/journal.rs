@@ -11,7 +11,7 @@
 //!
 //! | offset | size | field | valid range |
 //! |---|---|---|---|
-//! | 0 | 8 | magic | `DMTJRN03` |
+//! | 0 | 8 | magic | `DMTJRN04` |
 //! | 8 | 32 | fingerprint, BLAKE3 | |
 //! | 40 | .. | records | |
 //!
@@ -37,7 +37,7 @@ use xxhash_rust::xxh3::xxh3_64;
 
 /// The name of the journal in the work folder.
 const NAME: &str = "journal";
-const MAGIC: &[u8; 8] = b"DMTJRN03";
+const MAGIC: &[u8; 8] = b"DMTJRN04";
 /// The largest content of a record: a chunk of 2^16 cells a side has 400,000 diamonds of 60 bytes.
 const CONTENT_BYTES_MAX: u32 = 1 << 28;
 

@@ -11,7 +11,9 @@
 //! ```
 //!
 //! Whether a vertex may go depends on what surrounds it alone. So one that was tried in vain waits until that changes, or
-//! until the limit has grown to what it needs; and what has changed is tried in the next pass, under the next limit. The
+//! until the limit has grown to what it needs; and what has changed is tried in the next pass, under the next limit. What a
+//! vertex strictly within a half needs holds in the diamonds above as well, so it goes along with the half. Of all others
+//! it is at least how far their own samples will be, which says no to most before anything else is looked at. The
 //! farthest sample of each triangle is known from when it was allowed: nothing is measured twice.
 //!
 //! No other check of the topology is needed: triangles that turn left around a vertex which sees its whole rim
@@ -19,11 +21,12 @@
 
 use super::fan::Fan;
 use super::ground::Ground;
-use super::mesh::{Mesh, NONE, Star, next};
+use super::mesh::{Mesh, NONE, Star, next, triangle};
 use super::metric::{Costs, between, length, turn};
+use super::square::{Role, Square};
+use super::state::{State, at_least, below, shortened, unshortened, vertex};
 use super::{Rules, Vertex};
-use std::cmp::Reverse;
-use std::collections::{BinaryHeap, HashMap};
+use std::collections::HashMap;
 
 /// Where simplification stops.
 #[derive(Debug, Clone, Copy)]
@@ -51,56 +54,28 @@ pub enum Until<'a> {
     },
 }
 
-/// Where the limit of a count begins, in quanta, and how it grows: in finer steps there are more passes, and hardly fewer
-/// triangles.
+/// Where the limit of a count begins: at the least, in quanta, and so high that this many times as many vertices as are to
+/// go could, if each were alone. It begins with what is flat, so what a limit allows is taken where it is hardly seen; lower
+/// ones take more passes for more triangles.
 const LIMIT_LEAST: f64 = 0.5;
-const LIMIT_GROWTH: f64 = 1.2;
+const LIMIT_SHARE: f64 = 1.3;
 
-/// What may become of a vertex.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Role {
-    Free,
-    /// On the hypotenuse.
-    Along,
-    Locked,
-}
-
-/// The corners of a diamond in lattice coordinates: the ends of the hypotenuse and the apexes. Only the lower
-/// triangle may be there.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Square {
-    pub(super) a: Vertex,
-    pub(super) b: Vertex,
-    pub(super) lower: Vertex,
-    pub(super) upper: Option<Vertex>,
-}
-
-impl Square {
-    fn sides(&self) -> impl Iterator<Item = [Vertex; 2]> {
-        let apexes = std::iter::once(self.lower).chain(self.upper);
-        apexes.flat_map(|apex| [[self.a, apex], [apex, self.b]])
-    }
-
-    /// Whether a point lies inside, given how to scale the corners to its coordinates.
-    pub(super) fn contains(&self, v: Vertex, scaled: impl Fn(Vertex) -> Vertex) -> bool {
-        let far = self.upper.map_or([self.b, self.a], |upper| [self.b, upper]);
-        let corners = [self.a, self.lower, far[0], far[1]].map(scaled);
-        (0..4).all(|i| turn(corners[i], corners[(i + 1) % 4], v) >= 0)
-    }
-
-    fn role(&self, v: Vertex) -> Role {
-        if self.sides().any(|[p, q]| turn(p, q, v) == 0) {
-            Role::Locked
-        } else if turn(self.a, self.b, v) == 0 {
-            Role::Along
-        } else {
-            Role::Free
-        }
-    }
-}
+/// How the limit grows: in finer steps there are more passes, and fewer triangles.
+const LIMIT_GROWTH: f64 = 1.06;
 
 /// Points of the source's border that an edge of the border stands for.
 pub(super) type Passed = HashMap<u32, Vec<[u32; 2]>>;
+
+/// What is known of a mesh before it is simplified.
+#[derive(Debug)]
+pub(super) struct Before<'a> {
+    /// How far samples are from each triangle, in quanta, if that is known.
+    pub(super) errors: Vec<f32>,
+    /// What each vertex needs at least, [`shortened`]; none if nothing is known.
+    pub(super) needs: &'a [u16],
+    /// Whether it is the mesh of the source, with nothing gone yet.
+    pub(super) is_source: bool,
+}
 
 /// A mesh being simplified.
 #[derive(Debug)]
@@ -108,8 +83,6 @@ pub(super) struct Simplifier<'a> {
     pub(super) mesh: Mesh,
     /// By half-edges of the border.
     pub(super) passed: Passed,
-    /// Whether it is the mesh of the source, with nothing gone yet.
-    is_source: bool,
     square: Square,
     rules: &'a Rules,
     until: Until<'a>,
@@ -118,83 +91,48 @@ pub(super) struct Simplifier<'a> {
     costs: Costs,
     /// Of each vertex.
     states: Vec<State>,
-    /// By rank, those of the least first.
-    queue: BinaryHeap<Reverse<u64>>,
+    /// Vertices that may go in this pass, by rank.
+    queue: Vec<u64>,
     /// How far samples are from each triangle, in quanta, if that is known.
     pub(super) errors: Vec<f32>,
+    /// As [`Before`] says.
+    needs: &'a [u16],
+    is_source: bool,
     /// Of triangles of the star, if its centre goes the way that was looked at last.
-    found: Vec<(u32, f32)>,
+    found: Vec<(usize, f32)>,
     star: Star,
     fan: Fan,
-    /// Of the vertices around, as they are looked at in turn.
-    other: Star,
     ways: Vec<(f64, usize)>,
-}
-
-/// What is known of a vertex as long as nothing changes around it.
-#[derive(Debug, Clone, Copy)]
-struct State {
-    /// How important it is.
-    key: f32,
-    /// It cannot go under any limit below this: known once it has been tried.
-    needed: f32,
-    /// Whether nothing is lost with it.
-    flat: bool,
-    /// Whether both are known.
-    is_known: bool,
-    role: Role,
-}
-
-impl State {
-    fn is_flat_or_unknown(&self) -> bool {
-        self.flat || !self.is_known
-    }
-
-    /// Numbers that sort as the keys do, none of which is negative, and of equal keys as the vertices: so that the order
-    /// is the same on every run.
-    fn rank(&self, v: u32) -> u64 {
-        u64::from(self.key.to_bits()) << 32 | u64::from(v)
-    }
-}
-
-#[allow(clippy::cast_possible_truncation, reason = "the vertex is the lower half")]
-fn vertex(rank: u64) -> u32 {
-    rank as u32
 }
 
 impl<'a> Simplifier<'a> {
     pub(super) fn new(
         mesh: Mesh,
         passed: Passed,
-        errors: Vec<f32>,
-        is_source: bool,
+        before: Before<'a>,
         square: Square,
         rules: &'a Rules,
         until: Until<'a>,
     ) -> Self {
         let costs = Costs::new(&mesh, rules.metric, rules.lambda, rules.scale);
-        let state =
-            |v: &Vertex| State { key: 0.0, needed: 0.0, flat: false, is_known: false, role: square.role(*v) };
-        let states = mesh.points.iter().map(state).collect();
-        let queue = BinaryHeap::with_capacity(mesh.points.len());
-        let (star, other, ways) = (Star::default(), Star::default(), Vec::new());
+        let states = mesh.points.iter().map(|v| State::new(square.role(*v))).collect();
         Self {
             mesh,
             passed,
-            is_source,
             square,
             rules,
             until,
             target: 0,
             costs,
             states,
-            queue,
-            errors,
+            queue: Vec::new(),
+            errors: before.errors,
+            needs: before.needs,
+            is_source: before.is_source,
             found: Vec::new(),
-            star,
+            star: Star::default(),
             fan: Fan::default(),
-            other,
-            ways,
+            ways: Vec::new(),
         }
     }
 
@@ -235,6 +173,7 @@ impl<'a> Simplifier<'a> {
         let per_metre = self.rules.lambda / self.rules.scale.quantum;
         let most = (start + high - low).max(width * per_metre);
         self.look_at_all();
+        vertical = vertical.max(self.share_needs());
         loop {
             let border = if per_metre > 0.0 { vertical / per_metre } else { f64::INFINITY };
             self.until = Until::Error { ground, vertical, border };
@@ -246,14 +185,74 @@ impl<'a> Simplifier<'a> {
         }
     }
 
-    /// Has every vertex tried.
+    /// Has every vertex tried, but for what is known before.
     fn look_at_all(&mut self) {
-        for v in 0..u32::try_from(self.mesh.points.len()).unwrap_or(NONE) {
+        let known = if matches!(self.until, Until::Triangles(_)) { &[] } else { self.needs };
+        for v in 0..index(self.mesh.points.len()) {
             let tried = self.mesh.is_live(v) && self.may_go(v);
             let state = &mut self.states[v as usize];
             let stays = !tried || state.role == Role::Locked;
-            (state.needed, state.is_known) = (if stays { f32::INFINITY } else { 0.0 }, false);
+            let before = known.get(v as usize).filter(|_| state.role == Role::Free);
+            let needed = before.map_or(0.0, |short| unshortened(*short));
+            (state.needed, state.is_known) = (if stays { f32::INFINITY } else { needed }, false);
         }
+    }
+
+    /// What a share of the vertices that are to go will need at least: below that hardly anything is worth a pass.
+    fn share_needs(&mut self) -> f64 {
+        let mut needs = Vec::with_capacity(self.states.len());
+        for v in 0..index(self.states.len()) {
+            if self.states[v as usize].needed == 0.0 {
+                self.mesh.look(v, &mut self.star);
+                self.bound();
+            }
+            needs.extend(Some(self.states[v as usize].needed).filter(|needed| *needed < f32::INFINITY));
+        }
+        // Two triangles vanish with an inner vertex.
+        let go = self.mesh.live.saturating_sub(self.target) / 2;
+        #[allow(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "some more than there are triangles"
+        )]
+        let place = ((go as f64 * LIMIT_SHARE) as usize).min(needs.len().saturating_sub(1));
+        if needs.is_empty() { 0.0 } else { f64::from(*needs.select_nth_unstable_by(place, f32::total_cmp).1) }
+    }
+
+    /// Notes what the star's centre needs at least for its own sample, unless it lies at a border.
+    fn bound(&mut self) {
+        let v = self.star.centre;
+        if self.star.border || !self.has_sample(v) {
+            return;
+        }
+        self.fan.look(&self.mesh, &self.star);
+        let along = self.states[v as usize].role == Role::Along;
+        let off = self.fan.least_off(|to| !along || self.is_along(self.star.rim[to]));
+        self.states[v as usize].needed = below(off).max(0.0);
+    }
+
+    /// Whether the vertex has a sample that is to be kept.
+    fn has_sample(&self, v: u32) -> bool {
+        match self.until {
+            Until::Error { ground, .. } | Until::Within { ground, .. } => {
+                ground.has(self.mesh.points[v as usize])
+            }
+            Until::Triangles(_) => false,
+        }
+    }
+
+    /// What a vertex needs at least as long as nothing changes around it, shortened; 0 if that is not known, or may change
+    /// with what the diamond becomes a part of.
+    pub(super) fn known(&self) -> Vec<u16> {
+        let mut known = vec![0; self.mesh.points.len()];
+        for h in self.mesh.borders() {
+            known[self.mesh.origin(h) as usize] = u16::MAX;
+        }
+        for (known, state) in known.iter_mut().zip(&self.states) {
+            let holds = *known == 0 && state.role == Role::Free && state.needed < f32::INFINITY;
+            *known = if holds { shortened(state.needed) } else { 0 };
+        }
+        known
     }
 
     /// Collapses what a limit allows, the least important first. What changes after it was tried is tried again in
@@ -266,25 +265,16 @@ impl<'a> Simplifier<'a> {
         };
         self.fill(limit);
         let before = self.mesh.live;
+        let queue = std::mem::take(&mut self.queue);
         let mut is_enough = false;
-        while let Some(Reverse(rank)) = self.queue.pop() {
-            let v = vertex(rank);
-            if !self.states[v as usize].is_known {
-                let state = self.weigh(v);
-                let rank = state.rank(v);
-                // Something else may be less important now.
-                if self.queue.peek().is_some_and(|Reverse(least)| *least < rank) {
-                    self.queue.push(Reverse(rank));
-                    continue;
-                }
+        for v in queue.iter().map(|rank| vertex(*rank)) {
+            is_enough = is_enough || self.is_enough();
+            let mut state = self.states[v as usize];
+            // Beyond what is enough, and where nothing may be lost, only what is flat goes.
+            if !state.is_known && (is_enough || limit <= 0.0) {
+                self.mesh.look(v, &mut self.star);
+                state = self.weigh();
             }
-            if !is_enough && self.is_enough() {
-                is_enough = true;
-                let mut others = std::mem::take(&mut self.queue);
-                others.retain(|Reverse(rank)| self.states[vertex(*rank) as usize].is_flat_or_unknown());
-                self.queue = others;
-            }
-            let state = self.states[v as usize];
             if state.needed == f32::INFINITY || (is_enough && !state.flat) {
                 continue;
             }
@@ -295,24 +285,35 @@ impl<'a> Simplifier<'a> {
                 Err(at_least) => self.states[v as usize].needed = below(needed.min(at_least)),
             }
         }
+        self.queue = queue;
         self.mesh.live < before
     }
 
     /// Queues all that a limit may let go.
     fn fill(&mut self, limit: f64) {
-        let mut ranks = std::mem::take(&mut self.queue).into_vec();
-        for v in 0..u32::try_from(self.states.len()).unwrap_or(NONE) {
+        let mut ranks = std::mem::take(&mut self.queue);
+        ranks.clear();
+        let has_limit = limit > 0.0 && limit < f64::INFINITY;
+        for v in 0..index(self.states.len()) {
             let mut state = self.states[v as usize];
             if state.needed < f32::INFINITY && f64::from(state.needed) <= limit {
                 if !state.is_known {
-                    state = self.weigh(v);
+                    self.mesh.look(v, &mut self.star);
+                    if state.needed == 0.0 && has_limit {
+                        self.bound();
+                        if f64::from(self.states[v as usize].needed) > limit {
+                            continue;
+                        }
+                    }
+                    state = self.weigh();
                 }
                 if state.needed < f32::INFINITY {
-                    ranks.push(Reverse(state.rank(v)));
+                    ranks.push(state.rank(v));
                 }
             }
         }
-        self.queue = ranks.into();
+        ranks.sort_unstable();
+        self.queue = ranks;
     }
 
     /// The cheapest way whose triangles keep the limit, or what the others need at least; with the distances of these
@@ -354,9 +355,9 @@ impl<'a> Simplifier<'a> {
     }
 
     /// Finds out how important a vertex is that is not locked.
-    fn weigh(&mut self, v: u32) -> State {
-        let (key, flat) = self.costs.importance(&self.mesh, v, &mut self.other);
-        let state = &mut self.states[v as usize];
+    fn weigh(&mut self) -> State {
+        let (key, flat) = self.costs.importance(&self.mesh, &self.star);
+        let state = &mut self.states[self.star.centre as usize];
         #[allow(clippy::cast_possible_truncation, reason = "an order need not be precise")]
         let key = key.max(0.0) as f32;
         // Where nothing may be lost, and something would be, there is no need to try.
@@ -399,7 +400,9 @@ impl<'a> Simplifier<'a> {
         }
         let mut needed = f64::INFINITY;
         self.fan.look(mesh, star);
-        for to in 0..star.rim.len() {
+        // Opposite ways out of four leave the same two triangles.
+        let ways = if star.rim.len() == 4 && !star.border && !along { 2 } else { star.rim.len() };
+        for to in 0..ways {
             let is_end = to == 0 || to + 1 == star.rim.len();
             if star.border && !is_end {
                 continue;
@@ -411,10 +414,16 @@ impl<'a> Simplifier<'a> {
             if off > limit {
                 needed = needed.min(off);
             } else {
-                self.ways.push((self.costs.cost(mesh, star, &self.fan, to), to));
+                self.ways.push((0.0, to));
             }
         }
-        self.ways.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        // What a way costs matters beside others alone.
+        if self.ways.len() > 1 {
+            for (cost, to) in &mut self.ways {
+                *cost = self.costs.cost(mesh, star, &self.fan, *to);
+            }
+            self.ways.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        }
         needed
     }
 
@@ -437,12 +446,12 @@ impl<'a> Simplifier<'a> {
             if p == u || q == u {
                 continue;
             }
-            let distance = ground.distance([point(u), point(p), point(q)], *vertical);
+            let distance = ground.distance_within([point(u), point(p), point(q)], *vertical);
             most = most.max(distance);
             if most > *vertical {
                 break;
             }
-            self.found.push((star.spokes[i] / 3, at_least(distance)));
+            self.found.push((triangle(star.spokes[i]), at_least(distance)));
         }
         most
     }
@@ -491,7 +500,7 @@ impl<'a> Simplifier<'a> {
         }
         self.costs.follow(&self.mesh, &star, to);
         for (t, distance) in self.found.drain(..) {
-            if let Some(error) = self.errors.get_mut(t as usize) {
+            if let Some(error) = self.errors.get_mut(t) {
                 *error = distance;
             }
         }
@@ -506,19 +515,6 @@ impl<'a> Simplifier<'a> {
     }
 }
 
-/// The least short number that is no less.
-#[allow(clippy::cast_possible_truncation, reason = "rounded, and then made larger where that was to smaller")]
-pub(super) fn at_least(value: f64) -> f32 {
-    let short = value as f32;
-    if f64::from(short) < value { short.next_up() } else { short }
-}
-
-/// The next smaller number that is short.
-#[allow(clippy::cast_possible_truncation, reason = "rounded, and then made smaller")]
-fn below(value: f64) -> f32 {
-    (value as f32).next_down()
-}
-
 /// The distance between a point and a line between two vertices, in plan, in metres.
 pub(super) fn distance_to(scale: &super::Scale, [x, y]: [u32; 2], [a, b]: [Vertex; 2]) -> f64 {
     let flat = |v: Vertex| Vertex { height: 0, ..v };
@@ -527,4 +523,8 @@ pub(super) fn distance_to(scale: &super::Scale, [x, y]: [u32; 2], [a, b]: [Verte
     let share =
         if squared > 0.0 { ((along[0] * to[0] + along[1] * to[1]) / squared).clamp(0.0, 1.0) } else { 0.0 };
     (to[0] - share * along[0]).hypot(to[1] - share * along[1])
+}
+
+fn index(count: usize) -> u32 {
+    u32::try_from(count).unwrap_or(NONE)
 }

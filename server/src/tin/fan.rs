@@ -20,14 +20,13 @@ type Step = [f64; 3];
 /// The vertices around another one, counterclockwise.
 #[derive(Debug, Default)]
 pub(super) struct Fan {
-    /// One more than triangles: around a whole fan the first is the last, too.
+    /// Around a whole fan, all twice: so that those after any one follow one another.
     steps: Vec<Step>,
-    /// For each triangle, twice its area in plan.
+    /// For each triangle that follows a vertex, twice its area in plan; likewise.
     turns: Vec<f64>,
     /// Vertices around, each once.
     count: usize,
-    /// For each vertex, the turn from the way that is looked at to it.
-    about: Vec<f64>,
+    border: bool,
 }
 
 /// Twice the area of a triangle of the origin, in plan.
@@ -46,45 +45,67 @@ impl Fan {
         };
         self.steps.clear();
         self.steps.extend(star.rim.iter().map(seen));
-        self.count = self.steps.len();
-        if !star.border {
-            self.steps.extend_from_within(..1);
-        }
+        (self.count, self.border) = (self.steps.len(), star.border);
         self.turns.clear();
         self.turns.extend(self.steps.windows(2).map(|pair| turn(pair[0], pair[1])));
+        if !self.border {
+            let last = turn(self.steps[self.count - 1], self.steps[0]);
+            self.steps.extend_from_within(..);
+            self.turns.push(last);
+            self.turns.extend_from_within(..self.count - 1);
+        }
     }
 
-    /// Whether triangle `i` vanishes if the centre slides into the vertex `to`.
-    fn vanishes(&self, i: usize, to: usize) -> bool {
-        // The last one of a whole fan ends where the first begins.
-        i == to || i + 1 == to || (to == 0 && i + 1 == self.count)
+    /// The vertices whose triangles survive if the centre slides into the vertex `to`, at a border the first or the last:
+    /// all but that one, in turn.
+    fn rest(&self, to: usize) -> std::ops::Range<usize> {
+        match (self.border, to) {
+            (false, _) => to + 1..to + self.count,
+            (true, 0) => 1..self.count,
+            (true, _) => 0..self.count - 1,
+        }
     }
 
     /// How far the centre's own sample will be from the surface, in quanta, if the centre slides into the vertex
     /// `to`; `None` if a triangle would turn over.
-    pub(super) fn off(&mut self, to: usize) -> Option<f64> {
+    pub(super) fn off(&self, to: usize) -> Option<f64> {
         let u = self.steps[to];
-        self.about.clear();
-        self.about.extend(self.steps.iter().map(|p| turn(u, *p)));
+        let rest = self.rest(to);
+        let steps = &self.steps[rest.clone()];
+        let turns = &self.turns[rest.start..rest.end - 1];
         // All are whole numbers, exact below 2^53.
-        let mut off = 0.0;
-        for (i, (turn, (steps, about))) in
-            self.turns.iter().zip(self.steps.windows(2).zip(self.about.windows(2))).enumerate()
-        {
-            if self.vanishes(i, to) {
-                continue;
-            }
-            let (of_q, of_p) = (about[0], -about[1]);
-            let doubled = turn + of_p + of_q;
+        let (mut off, mut area) = (0.0, 1.0);
+        let mut here = turn(u, steps[0]);
+        for (pair, between) in steps.windows(2).zip(turns) {
+            let there = turn(u, pair[1]);
+            let doubled = between + here - there;
             if doubled <= 0.0 {
                 return None;
             }
-            if of_p >= 0.0 && of_q >= 0.0 {
-                let height = turn * u[2] + of_p * steps[0][2] + of_q * steps[1][2];
-                off = height.abs() / doubled;
+            if here >= 0.0 && there <= 0.0 {
+                let height = between * u[2] + here * pair[1][2] - there * pair[0][2];
+                (off, area) = (height.abs(), doubled);
             }
+            here = there;
         }
-        Some(off)
+        Some(off / area)
+    }
+
+    /// How far the centre's own sample will be from the surface at least, whichever way the centre goes of those that
+    /// `may` be gone; infinite if there is none.
+    pub(super) fn least_off(&self, may: impl Fn(usize) -> bool) -> f64 {
+        let half = self.count / 2;
+        let opposite = |i: usize| {
+            let (here, there) = (self.steps[i], self.steps[i + half]);
+            here[0] == -there[0] && here[1] == -there[1]
+        };
+        let ways = (0..self.count).filter(|to| may(*to));
+        if !self.border && self.count.is_multiple_of(2) && (0..half).all(opposite) {
+            // As in a lattice: what is opposite of a vertex is another one, and the centre halfway between them.
+            let bend = |to: usize| self.steps[to][2] + self.steps[(to + half) % self.count][2];
+            return ways.map(|to| 0.5 * bend(to).abs()).fold(f64::INFINITY, f64::min);
+        }
+        ways.filter_map(|to| self.off(to)).fold(f64::INFINITY, f64::min)
     }
 
     /// How much the normals of the triangles that survive change: the sum of (A + A')/2 (1 - n . n') over them, given
@@ -94,25 +115,23 @@ impl Fan {
         let [x, y, z] = [scale.cell[0], scale.cell[1], scale.quantum];
         let metres = [0.5 * y * z, 0.5 * z * x, 0.5 * x * y];
         let u = self.steps[to];
-        let with = |i: usize| {
-            let p = self.steps[i];
+        let with = |p: Step| {
             [
                 (u[1] * p[2] - u[2] * p[1]) * metres[0],
                 (u[2] * p[0] - u[0] * p[2]) * metres[1],
-                self.about[i] * metres[2],
+                turn(u, p) * metres[2],
             ]
         };
+        let rest = self.rest(to);
         let mut sum = 0.0;
-        let mut here = with(0);
-        for i in 0..self.turns.len() {
-            let there = with(i + 1);
-            if !self.vanishes(i, to) {
-                let (old, area) = now(i);
-                let new: Vector = std::array::from_fn(|k| old[k] + here[k] - there[k]);
-                let area_new = length(new);
-                let dot = old[0] * new[0] + old[1] * new[1] + old[2] * new[2];
-                sum += 0.5 * (area + area_new) * (1.0 - dot / (area * area_new));
-            }
+        let mut here = with(self.steps[rest.start]);
+        for i in rest.start..rest.end - 1 {
+            let there = with(self.steps[i + 1]);
+            let (old, area) = now(if i < self.count { i } else { i - self.count });
+            let new: Vector = std::array::from_fn(|k| old[k] + here[k] - there[k]);
+            let area_new = length(new);
+            let dot = old[0] * new[0] + old[1] * new[1] + old[2] * new[2];
+            sum += 0.5 * (area + area_new) * (1.0 - dot / (area * area_new));
             here = there;
         }
         sum
@@ -131,11 +150,13 @@ mod tests {
         fn the_centre_is_off_as_far_as_the_triangle_that_covers_it(
             rim in prop::collection::vec((1u32..=6, -900i32..900), 8),
             whole: bool,
+            symmetric: bool,
             height in -900i32..900,
         ) {
             const AROUND: [[i32; 2]; 8] = [[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1], [1, -1]];
             let centre = Vertex { x: 10, y: 10, height };
-            let around = AROUND.iter().zip(&rim).map(|([x, y], (away, height))| {
+            let around = AROUND.iter().enumerate().map(|(i, [x, y])| {
+                let (away, height) = (&rim[if symmetric { i % 4 } else { i }].0, &rim[i].1);
                 let at = |w: i32| 10u32.wrapping_add_signed(w * away.cast_signed());
                 Vertex { x: at(*x), y: at(*y), height: *height }
             });
@@ -149,18 +170,27 @@ mod tests {
             heights[10 * 21 + 10] = height;
             let ground = Ground { origin: [0, 0], width: 21, heights: &heights };
             let point = |v: u32| mesh.points[v as usize];
-            for to in 0..star.rim.len() {
+            let mut least = f64::INFINITY;
+            let mut turns = false;
+            let last = star.rim.len() - 1;
+            let is_way = |to: usize| whole || to == 0 || to == last;
+            for to in (0..=last).filter(|to| is_way(*to)) {
                 let u = star.rim[to];
                 let rest = (0..star.spokes.len()).map(|i| star.edge(i)).filter(|edge| !edge.contains(&u));
                 let rest: Vec<[Vertex; 3]> = rest.map(|[p, q]| [point(u), point(p), point(q)]).collect();
                 let turns_over = rest.iter().any(|[a, b, c]| super::super::metric::turn(*a, *b, *c) <= 0);
                 let off = fan.off(to);
                 prop_assert_eq!(off.is_none(), turns_over);
+                turns |= turns_over;
+                least = least.min(off.unwrap_or(f64::INFINITY));
                 if let Some(off) = off {
                     let expected = rest.iter().map(|t| ground.distance(*t, f64::INFINITY)).fold(0.0, f64::max);
                     prop_assert!((off - expected).abs() <= 1e-9 * expected, "{off}, expected {expected}");
                 }
             }
+            let found = fan.least_off(is_way);
+            prop_assert!(found <= least, "{found}, expected {least}");
+            prop_assert!(turns || found == least, "{found}, expected {least}");
         }
     }
 }

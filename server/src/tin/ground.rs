@@ -68,57 +68,150 @@ impl Ground<'_> {
     /// The largest distance, in quanta, between a triangle (which turns left) and the samples of the rectangle that it
     /// covers, or something above `limit` as soon as that is known. Samples without height count for nothing.
     #[must_use]
-    pub fn distance(&self, [a, b, c]: [Vertex; 3], limit: f64) -> f64 {
+    pub fn distance(&self, corners: [Vertex; 3], limit: f64) -> f64 {
+        let off = corners.map(|v| self.off(v)).into_iter().fold(0.0, f64::max);
+        if off > limit { off } else { self.distance_within(corners, limit).max(off) }
+    }
+
+    /// [`Ground::distance`] of a triangle whose corners are known to be samples.
+    #[must_use]
+    pub(super) fn distance_within(&self, [a, b, c]: [Vertex; 3], limit: f64) -> f64 {
+        let step = |w: u32, o: u32| w.wrapping_sub(o).cast_signed();
+        let local = |v: Vertex| [step(v.x, self.origin[0]), step(v.y, self.origin[1])];
+        let sides = Sides::new([local(a), local(b), local(c)]);
+        let last = [self.width, self.heights.len() / self.width].map(|samples| samples as i32 - 1);
+        // A row with one corner alone has no other sample.
+        let low = sides.low[1] + i32::from(sides.low[1] != sides.middle[1]);
+        let high = sides.high[1] - i32::from(sides.high[1] != sides.middle[1]);
+        let (low, high) = (low.max(0), high.min(last[1]));
         let doubled = turn(a, b, c);
-        if doubled == 1 {
-            // No other lattice point has room in it.
-            return [a, b, c].map(|v| self.off(v)).into_iter().fold(0.0, f64::max);
+        // In the least triangles no other lattice point has room.
+        if low > high || doubled == 1 {
+            return 0.0;
         }
         let doubled = doubled as f64;
-        let local = |v: Vertex| {
-            let step = |w: u32, o: u32| i64::from(w.wrapping_sub(o).cast_signed());
-            [step(v.x, self.origin[0]), step(v.y, self.origin[1])]
-        };
-        let corners = [local(a), local(b), local(c)];
-        let sides = Sides::new(corners);
-        let rows = (self.heights.len() / self.width) as i64;
-        let (low, high) = (sides.low[1].max(0), sides.high[1].min(rows - 1));
         // The plane, times D: D h = D h_a + east (x - x_a) + north (y - y_a).
-        let [ab, ac] = [b, c].map(|v| {
-            let step = |w: u32, o: u32| f64::from(w.wrapping_sub(o).cast_signed());
-            [step(v.x, a.x), step(v.y, a.y), f64::from(v.height - a.height)]
-        });
+        let of_side = |v: Vertex| {
+            [f64::from(step(v.x, a.x)), f64::from(step(v.y, a.y)), f64::from(v.height - a.height)]
+        };
+        let (ab, ac) = (of_side(b), of_side(c));
         let east = ab[2] * ac[1] - ac[2] * ab[1];
         let north = ab[0] * ac[2] - ac[0] * ab[2];
-        let start =
-            f64::from(a.height) * doubled - east * corners[0][0] as f64 - north * corners[0][1] as f64;
-        let limit = limit * doubled;
-        let mut worst = 0.0f64;
-        for y in low..=high {
-            let Some((from, to)) = sides.span(y, self.width as i64 - 1) else { continue };
-            let row = &self.heights[y as usize * self.width..][from as usize..=to as usize];
-            let here = start + north * y as f64 + east * from as f64;
-            worst = worst.max(run(row, here, east, doubled));
-            if worst > limit {
-                break;
-            }
+        let corner = local(a).map(f64::from);
+        let start = f64::from(a.height) * doubled - east * corner[0] - north * corner[1];
+        let plane = Plane { start, east, north, doubled };
+        let spans = sides.spans();
+        let worst = self.worst::<false>(&plane, &spans, [low, high], limit * doubled);
+        // No height is as far off, but what stands for none is.
+        if worst >= doubled * NODATA_AWAY {
+            return self.worst::<true>(&plane, &spans, [low, high], limit * doubled) / doubled;
         }
         worst / doubled
     }
+
+    /// The largest distance of the samples in some rows, times D; or something above `limit`. Whether samples without
+    /// height are looked for.
+    fn worst<const GAPS: bool>(&self, plane: &Plane, spans: &Spans, rows: [i32; 2], limit: f64) -> f64 {
+        let last = self.width as i32 - 1;
+        let mut worst = [0.0f64; LANES];
+        let mut since = 0;
+        for y in rows[0]..=rows[1] {
+            let [from, to] = spans.at(y);
+            let (from, to) = (from.max(0), to.min(last));
+            if from > to {
+                continue;
+            }
+            let row = &self.heights[y as usize * self.width..][from as usize..=to as usize];
+            let start = plane.start + plane.north * f64::from(y) + plane.east * f64::from(from);
+            run::<GAPS>(row, start, plane, &mut worst);
+            since += row.len();
+            if since > SAMPLES_BETWEEN {
+                since = 0;
+                if most(worst) > limit {
+                    break;
+                }
+            }
+        }
+        most(worst)
+    }
+}
+
+/// Distances that are looked at side by side.
+const LANES: usize = 4;
+
+/// Samples after which it is worth a look whether the limit is exceeded.
+const SAMPLES_BETWEEN: usize = 64;
+
+/// Twice as far as any two heights are apart is less than this, in quanta; from what stands for none it is more.
+const NODATA_AWAY: f64 = (1u32 << 30) as f64;
+
+/// A triangle's plane: at column i of row j its height is (start + east * i + north * j) / doubled.
+struct Plane {
+    start: f64,
+    east: f64,
+    north: f64,
+    doubled: f64,
+}
+
+fn most(worst: [f64; LANES]) -> f64 {
+    worst.into_iter().fold(0.0, f64::max)
 }
 
 /// A triangle's sides, from its lowest corner up: one goes all the way, the other one by the corner between.
 struct Sides {
-    low: [i64; 2],
-    middle: [i64; 2],
-    high: [i64; 2],
+    low: [i32; 2],
+    middle: [i32; 2],
+    high: [i32; 2],
     /// Whether the side by the middle lies in the east.
     is_east: bool,
 }
 
+/// A side as a line: where it is at a row, and a share of what two such places differ by at least.
+#[derive(Clone, Copy)]
+struct Line {
+    /// Of the lower end.
+    from: [f64; 2],
+    /// Along x for each row.
+    slope: f64,
+    /// Half of what a place that is no whole number is away from the next one at least.
+    least: f64,
+}
+
+impl Line {
+    fn new(from: [i32; 2], to: [i32; 2]) -> Self {
+        // Of a flat side nothing but its lower end is asked.
+        let each = 1.0 / f64::from((to[1] - from[1]).max(1));
+        Self { from: from.map(f64::from), slope: f64::from(to[0] - from[0]) * each, least: 0.5 * each }
+    }
+
+    fn at(&self, y: f64) -> f64 {
+        self.from[0] + (y - self.from[1]) * self.slope
+    }
+}
+
+/// Which samples of a row lie between the sides.
+struct Spans {
+    all: Line,
+    /// Up to the middle, and from there on.
+    by: [Line; 2],
+    middle: i32,
+    is_east: bool,
+}
+
+impl Spans {
+    /// The first and the last sample of a row that lie in the triangle, edges included. The places are rounded by less
+    /// than 2^-26, and none of them is as near to a whole number without being one as 2^-25: sides are at most as high.
+    fn at(&self, y: i32) -> [i32; 2] {
+        let by = self.by[usize::from(y >= self.middle)];
+        let [west, east] = if self.is_east { [self.all, by] } else { [by, self.all] };
+        let y = f64::from(y);
+        [ceil(west.at(y) - west.least), -ceil(-(east.at(y) + east.least))]
+    }
+}
+
 impl Sides {
     /// Those of a triangle that turns left.
-    fn new([a, b, c]: [[i64; 2]; 3]) -> Self {
+    fn new([a, b, c]: [[i32; 2]; 3]) -> Self {
         // Turned until the lowest comes first; what follows it is in the east.
         let [low, next, last] = if a[1] <= b[1] && a[1] <= c[1] {
             [a, b, c]
@@ -132,51 +225,40 @@ impl Sides {
         Self { low, middle, high, is_east }
     }
 
-    /// The samples of a row that lie in the triangle, edges included, within 0 to `last`.
-    fn span(&self, y: i64, last: i64) -> Option<(i64, i64)> {
-        let Self { low, middle, high, .. } = *self;
-        // A quotient that is whole comes out whole, and no other does: numbers are below 2^26.
-        let at = |p: [i64; 2], q: [i64; 2]| {
-            p[0] as f64 + ((y - p[1]) * (q[0] - p[0])) as f64 / (q[1] - p[1]) as f64
-        };
-        let all = at(low, high);
-        let by = if y < middle[1] {
-            at(low, middle)
-        } else if y > middle[1] {
-            at(middle, high)
-        } else {
-            middle[0] as f64
-        };
-        let (west, east) = if self.is_east { (all, by) } else { (by, all) };
-        let (from, to) = (ceil(west).max(0), (-ceil(-east)).min(last));
-        (from <= to).then_some((from, to))
+    fn spans(&self) -> Spans {
+        let Self { low, middle, high, is_east } = *self;
+        Spans {
+            all: Line::new(low, high),
+            by: [Line::new(low, middle), Line::new(middle, high)],
+            middle: middle[1],
+            is_east,
+        }
     }
 }
 
 /// The least whole number at or above `x`. Without a call, which `f64::ceil` is where a machine is taken for an old one.
 #[allow(clippy::cast_possible_truncation, reason = "coordinates are below 2^26")]
-fn ceil(x: f64) -> i64 {
-    let toward_zero = x as i64;
-    toward_zero + i64::from((toward_zero as f64) < x)
+fn ceil(x: f64) -> i32 {
+    let toward_zero = x as i32;
+    toward_zero + i32::from(f64::from(toward_zero) < x)
 }
 
-/// The largest of `|h * doubled - (start + east * i)|` over a row.
-fn run(row: &[i32], start: f64, east: f64, doubled: f64) -> f64 {
-    const LANES: usize = 8;
-    let distance = |i: usize, h: i32| {
-        let distance = (f64::from(h) * doubled - (start + east * i as f64)).abs();
-        if h == NODATA { 0.0 } else { distance }
+/// Takes the largest of `|h * doubled - (start + east * i)|` over a row into `worst`.
+fn run<const GAPS: bool>(row: &[i32], start: f64, plane: &Plane, worst: &mut [f64; LANES]) {
+    let mut take = |lane: usize, i: usize, h: i32| {
+        let distance = (f64::from(h) * plane.doubled - (start + plane.east * i as f64)).abs();
+        let distance = if GAPS && h == NODATA { 0.0 } else { distance };
+        worst[lane] = if distance > worst[lane] { distance } else { worst[lane] };
     };
-    let mut worst = [0.0f64; LANES];
-    let (lanes, rest) = row.as_chunks::<LANES>();
-    for (k, chunk) in lanes.iter().enumerate() {
-        for (i, h) in chunk.iter().enumerate() {
-            let here = distance(k * LANES + i, *h);
-            worst[i] = if here > worst[i] { here } else { worst[i] };
+    let (chunks, rest) = row.as_chunks::<LANES>();
+    for (k, chunk) in chunks.iter().enumerate() {
+        for (lane, h) in chunk.iter().enumerate() {
+            take(lane, k * LANES + lane, *h);
         }
     }
-    let most = worst.into_iter().fold(0.0, f64::max);
-    rest.iter().enumerate().map(|(i, h)| distance(lanes.len() * LANES + i, *h)).fold(most, f64::max)
+    for (lane, h) in rest.iter().enumerate() {
+        take(lane, chunks.len() * LANES + lane, *h);
+    }
 }
 
 #[cfg(test)]

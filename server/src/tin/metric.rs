@@ -22,7 +22,7 @@
 //! length of the edge that is moved along: an area, as the others are.
 
 use super::fan::Fan;
-use super::mesh::{Mesh, Star};
+use super::mesh::{Mesh, NONE, Star, triangle};
 use super::{Metric, Scale, Vertex};
 
 pub(super) type Vector = [f64; 3];
@@ -100,8 +100,9 @@ pub(super) struct Costs {
 impl Costs {
     pub(super) fn new(mesh: &Mesh, metric: Metric, lambda: f64, scale: Scale) -> Self {
         let corner = |v: u32| mesh.points[v as usize];
-        let triangles = mesh.origins.as_chunks::<3>().0;
-        let vectors = triangles.iter().map(|t| with_length(area_vector(&scale, t.map(corner)))).collect();
+        // A mesh that is new has all its triangles.
+        let vectors =
+            mesh.triangles().map(|(_, t)| with_length(area_vector(&scale, t.map(corner)))).collect();
         let origin = mesh.points.first().copied().unwrap_or_default();
         let mut costs = Self { scale, lambda, vectors, quadrics: Vec::new(), origin };
         if metric == Metric::Quadric {
@@ -113,10 +114,10 @@ impl Costs {
     fn all_quadrics(&self, mesh: &Mesh) -> Vec<Quadric> {
         let at = |v: u32| between(&self.scale, self.origin, mesh.points[v as usize]);
         let mut quadrics = vec![Quadric::default(); mesh.points.len()];
-        for (t, (vector, area)) in mesh.origins.as_chunks::<3>().0.iter().zip(&self.vectors) {
+        for ((_, t), (vector, area)) in mesh.triangles().zip(&self.vectors) {
             let plane = Quadric::plane(vector.map(|w| w / area), at(t[0]), *area / 3.0);
             for v in t {
-                quadrics[*v as usize].add(&plane);
+                quadrics[v as usize].add(&plane);
             }
         }
         for h in mesh.borders() {
@@ -132,20 +133,20 @@ impl Costs {
         quadrics
     }
 
-    /// What a vertex is worth: those of the least go first. And whether its surroundings are a plane, so that nothing
-    /// is lost with it. `star` is looked at where the triangles alone do not tell.
-    pub(super) fn importance(&self, mesh: &Mesh, v: u32, star: &mut Star) -> (f64, bool) {
+    /// What a star's centre is worth: those of the least go first. And whether its surroundings are a plane, so that
+    /// nothing is lost with it.
+    pub(super) fn importance(&self, mesh: &Mesh, star: &Star) -> (f64, bool) {
         let (mut areas, mut sum) = (0.0, [0.0; 3]);
-        let border = mesh.around(v, |t| {
-            let (vector, area) = self.vectors[t];
+        for spoke in &star.spokes {
+            let (vector, area) = self.vectors[triangle(*spoke)];
             areas += area;
             sum = [sum[0] + vector[0], sum[1] + vector[1], sum[2] + vector[2]];
-        });
+        }
+        let border = star.border;
         let varies = areas - length(sum);
         if !border && self.quadrics.is_empty() {
             return (varies, varies <= FLAT * areas);
         }
-        mesh.look(v, star);
         let bend =
             if border { self.lambda * self.bend(mesh, star, 0).min(self.bend(mesh, star, 1)) } else { 0.0 };
         let flat = varies <= FLAT * areas && bend <= FLAT * areas;
@@ -162,7 +163,7 @@ impl Costs {
         if !self.quadrics.is_empty() {
             return self.quadric(mesh, star, to);
         }
-        let changes = fan.cost(&self.scale, to, |i| self.vectors[star.spokes[i] as usize / 3]);
+        let changes = fan.cost(&self.scale, to, |i| self.vectors[triangle(star.spokes[i])]);
         if star.border {
             return changes + self.lambda * self.bend(mesh, star, usize::from(to > 0));
         }
@@ -195,9 +196,9 @@ impl Costs {
             self.quadrics[u as usize].add(&gone);
         }
         for spoke in &star.spokes {
-            let t = *spoke as usize / 3;
-            let corners = mesh.origins.as_chunks::<3>().0[t];
-            if corners[0] != super::mesh::NONE {
+            let t = triangle(*spoke);
+            let corners = mesh.corners(t);
+            if corners[0] != NONE {
                 let points = corners.map(|v| mesh.points[v as usize]);
                 self.vectors[t] = with_length(area_vector(&self.scale, points));
             }

@@ -24,6 +24,8 @@ mod ground;
 mod mesh;
 mod metric;
 mod patch;
+mod square;
+mod state;
 
 pub use collapse::Until;
 pub use ground::Ground;

@@ -1,9 +1,11 @@
 //! The mesh of a triangle of the bintree; four of them merged, simplified, and cut in two.
 
-use super::collapse::{Passed, Simplifier, Square, Until, at_least, distance_to};
+use super::collapse::{Before, Passed, Simplifier, Until, distance_to};
 use super::ground::Ground;
-use super::mesh::{Mesh, NONE};
+use super::mesh::{Mesh, NONE, triangle};
 use super::metric::{between, length, turn};
+use super::square::Square;
+use super::state::at_least;
 use super::{Rules, Vertex};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
@@ -26,6 +28,9 @@ pub struct Tin {
     pub borders: Vec<Border>,
     /// How far samples are from each triangle, in quanta, a little more at most; none if that is not known.
     pub errors: Vec<f32>,
+    /// What vertices need at least to go, in quanta, the upper half of an `f32`; 0 if that is not known. None if it is
+    /// known of none.
+    pub needs: Vec<u16>,
     /// How far what was left out since there was no room for it lies from what is there, in metres.
     pub lost: f64,
 }
@@ -39,6 +44,8 @@ pub struct Merged {
     pub borders: Vec<Border>,
     /// See [`Tin::errors`].
     pub errors: Vec<f32>,
+    /// See [`Tin::needs`].
+    needs: Vec<u16>,
     /// See [`Tin::lost`].
     pub lost: f64,
     /// Whether it is the source's own mesh.
@@ -137,19 +144,23 @@ pub fn merge(forest: &Forest, d: Diamond, tins: [&Tin; 4]) -> Merged {
         let numbers: Vec<u32> = tin
             .vertices
             .iter()
-            .map(|v| {
+            .enumerate()
+            .map(|(i, v)| {
                 let next = u32::try_from(merged.patch.vertices.len()).unwrap_or(NONE);
                 // Two lines through the centre part the four.
                 let is_shared = turn(square.a, centre, *v) == 0 || turn(square.lower, centre, *v) == 0;
                 let number = if is_shared { *shared.entry([v.x, v.y]).or_insert(next) } else { next };
                 if number == next {
                     merged.patch.vertices.push(*v);
+                    // What lies on a side has other triangles around it now.
+                    merged.needs.push(tin.needs.get(i).copied().filter(|_| !is_shared).unwrap_or(0));
                 }
                 number
             })
             .collect();
         let renumber = |v: &u32| numbers[*v as usize];
-        merged.patch.triangles.extend(tin.triangles.iter().map(|t| t.each_ref().map(renumber)));
+        let triangle = |[a, b, c]: &[u32; 3]| [renumber(a), renumber(b), renumber(c)];
+        merged.patch.triangles.extend(tin.triangles.iter().map(triangle));
         merged.errors.extend_from_slice(&tin.errors);
         merged.patch.ends[i] = u32::try_from(merged.patch.triangles.len()).unwrap_or(NONE);
         merged
@@ -171,9 +182,11 @@ pub fn simplify(forest: &Forest, d: Diamond, merged: &Merged, rules: &Rules, unt
     let square = square(forest, d);
     let mesh = Mesh::new(&merged.patch.vertices, &merged.patch.triangles);
     let passed = find_passed(&mesh, merged);
-    let errors = find_errors(merged, &until);
-    let mut simplifier = Simplifier::new(mesh, passed, errors, merged.is_source, square, rules, until);
+    let before =
+        Before { errors: find_errors(merged, &until), needs: &merged.needs, is_source: merged.is_source };
+    let mut simplifier = Simplifier::new(mesh, passed, before, square, rules, until);
     simplifier.run();
+    let needs = if simplifier.errors.is_empty() { Vec::new() } else { simplifier.known() };
     let Simplifier { mesh, passed, errors, .. } = simplifier;
     let point = |v: u32| mesh.points[v as usize];
     let distance = |(h, points): (&u32, &Vec<[u32; 2]>)| {
@@ -181,7 +194,8 @@ pub fn simplify(forest: &Forest, d: Diamond, merged: &Merged, rules: &Rules, unt
         points.iter().map(|p| distance_to(&rules.scale, *p, ends)).fold(0.0, f64::max)
     };
     let apart = passed.iter().map(distance).fold(0.0, f64::max) + merged.lost;
-    let mut simplified = Simplified { halves: cut(&mesh, passed, &errors, &square), apart, vertical: None };
+    let mut simplified =
+        Simplified { halves: cut(&mesh, passed, &errors, &needs, &square), apart, vertical: None };
     for half in &mut simplified.halves {
         half.lost = merged.lost;
         if half.triangles.len() > rules.triangles_max || half.vertices.len() > rules.vertices_max {
@@ -268,33 +282,38 @@ fn find_passed(mesh: &Mesh, merged: &Merged) -> Passed {
 }
 
 /// Cuts a mesh along the hypotenuse.
-fn cut(mesh: &Mesh, mut passed: Passed, errors: &[f32], square: &Square) -> [Tin; 2] {
+fn cut(mesh: &Mesh, mut passed: Passed, errors: &[f32], needs: &[u16], square: &Square) -> [Tin; 2] {
     let mut halves = [Tin::default(), Tin::default()];
     let mut numbers = [vec![NONE; mesh.points.len()], vec![NONE; mesh.points.len()]];
-    let side = |t: [u32; 3]| {
-        let turns = t.map(|v| turn(square.a, square.b, mesh.points[v as usize]));
-        usize::from(turns.into_iter().any(|turn| turn > 0))
-    };
+    let is_above = |v: u32| turn(square.a, square.b, mesh.points[v as usize]) > 0;
+    let side = |[a, b, c]: [u32; 3]| usize::from(is_above(a) || is_above(b) || is_above(c));
+    for half in &mut halves {
+        // Each has about half of the triangles, and half as many vertices.
+        half.triangles.reserve(mesh.live / 2);
+        half.vertices.reserve(mesh.live / 4);
+    }
     for (number, t) in mesh.triangles() {
         let i = side(t);
         let (half, numbers) = (&mut halves[i], &mut numbers[i]);
         half.errors.extend(errors.get(number));
-        half.triangles.push(t.map(|v| {
+        let mut name = |v: u32| {
             let number = &mut numbers[v as usize];
             if *number == NONE {
                 *number = u32::try_from(half.vertices.len()).unwrap_or(NONE);
                 half.vertices.push(mesh.points[v as usize]);
+                half.needs.extend(needs.get(v as usize));
             }
             *number
-        }));
+        };
+        let [a, b, c] = t;
+        half.triangles.push([name(a), name(b), name(c)]);
     }
     if passed.is_empty() {
         return halves;
     }
     for h in mesh.borders() {
         if let Some(points) = passed.remove(&h) {
-            let first = h as usize / 3 * 3;
-            let i = side([mesh.origins[first], mesh.origins[first + 1], mesh.origins[first + 2]]);
+            let i = side(mesh.corners(triangle(h)));
             halves[i]
                 .borders
                 .push(([mesh.origin(h), mesh.target(h)].map(|v| numbers[i][v as usize]), points));

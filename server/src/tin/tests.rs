@@ -430,6 +430,39 @@ fn a_limit_that_grows_ends_at_the_count_with_smaller_errors() {
     assert!(10 * fewer > 8 * all, "{fewer} of {all} have no larger error");
 }
 
+/// What levels above do not try again since a half says that it is in vain.
+#[test]
+fn vertices_need_as_much_as_halves_say() {
+    let (mut said, mut all) = (0, 0);
+    for (name, field) in fields() {
+        let rules = rules(Metric::Normal, 1.0);
+        let ground = field.ground();
+        let built = build(&field, &rules, |_| Until::Within { triangles: 40, ground: nowhere() });
+        for half in built.whole.values().flat_map(|whole| &whole.simplified.halves) {
+            let point = |v: u32| half.vertices[v as usize];
+            all += half.vertices.len();
+            for (v, need) in (0u32..).zip(&half.needs).filter(|(_, need)| **need > 0) {
+                said += 1;
+                let around: Vec<&[u32; 3]> = half.triangles.iter().filter(|t| t.contains(&v)).collect();
+                let ways: BTreeSet<u32> = around.iter().flat_map(|t| **t).filter(|u| *u != v).collect();
+                let needed = ways.into_iter().map(|u| {
+                    let moved = |t: &&[u32; 3]| t.map(|w| point(if w == v { u } else { w }));
+                    let rest = around.iter().filter(|t| !t.contains(&u)).map(moved);
+                    let distance = |t: [Vertex; 3]| {
+                        let turns_over = super::metric::turn(t[0], t[1], t[2]) <= 0;
+                        if turns_over { f64::INFINITY } else { ground.distance(t, f64::INFINITY) }
+                    };
+                    rest.map(distance).fold(0.0, f64::max)
+                });
+                let needed = needed.fold(f64::INFINITY, f64::min);
+                let known = f64::from(super::state::unshortened(*need));
+                assert!(known <= needed, "{name}: {known} said, {needed} needed");
+            }
+        }
+    }
+    assert!(said > 1000, "{said} of {all}");
+}
+
 #[test]
 fn ground_that_is_plane_is_two_triangles_a_square() {
     for (name, field) in fields() {

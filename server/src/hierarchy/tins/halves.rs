@@ -9,9 +9,11 @@
 //! | 8 | 8 | how far what was left out lies from what is there, in metres |
 //! | 16 | 4 + 4 + 4 | vertices v, triangles t, borders b |
 //! | 28 | 4 | errors e: t or 0 |
-//! | 32 | 12 v | x, y, height |
+//! | 32 | 4 | needs n: v or 0 |
+//! | 36 | 12 v | x, y, height |
 //! | .. | 12 t, or 6 t where indices fit in 16 bits | indices |
 //! | .. | 4 e | how far samples are from each triangle, in quanta |
+//! | .. | 2 n | what vertices need at least to go, in quanta: the upper half of an `f32` |
 //! | .. | 12 b | two vertices, points |
 //! | .. | 8 a point | x, y |
 
@@ -127,7 +129,9 @@ fn write(tin: &Tin, out: &mut Vec<u8>) {
     out.extend([0; 8]);
     out.extend(tin.lost.to_le_bytes());
     let mut put = |number: u32| out.extend(number.to_le_bytes());
-    for count in [tin.vertices.len(), tin.triangles.len(), tin.borders.len(), tin.errors.len()] {
+    for count in
+        [tin.vertices.len(), tin.triangles.len(), tin.borders.len(), tin.errors.len(), tin.needs.len()]
+    {
         put(u32::try_from(count).unwrap_or(u32::MAX));
     }
     for v in &tin.vertices {
@@ -141,6 +145,7 @@ fn write(tin: &Tin, out: &mut Vec<u8>) {
         tin.triangles.as_flattened().iter().for_each(|v| out.extend(v.to_le_bytes()));
     }
     tin.errors.iter().for_each(|error| out.extend(error.to_le_bytes()));
+    tin.needs.iter().for_each(|need| out.extend(need.to_le_bytes()));
     for ([a, b], points) in &tin.borders {
         for number in [*a, *b, u32::try_from(points.len()).unwrap_or(u32::MAX)] {
             out.extend(number.to_le_bytes());
@@ -163,7 +168,7 @@ fn read(bytes: &[u8]) -> Option<Tin> {
         rest = later;
         Some(now.as_chunks::<4>().0.iter().map(|b| u32::from_le_bytes(*b)))
     };
-    let counts: Vec<usize> = numbers(4)?.map(|n| n as usize).collect();
+    let counts: Vec<usize> = numbers(5)?.map(|n| n as usize).collect();
     let mut tin = Tin { lost: f64::from_le_bytes(*lost), ..Tin::default() };
     let flat: Vec<u32> = numbers(3 * counts[0])?.collect();
     let vertex = |v: &[u32; 3]| Vertex { x: v[0], y: v[1], height: v[2].cast_signed() };
@@ -178,12 +183,15 @@ fn read(bytes: &[u8]) -> Option<Tin> {
         let flat: Vec<u32> = numbers(3 * counts[1])?.collect();
         tin.triangles = flat.as_chunks::<3>().0.to_vec();
     }
+    let (errors, rest) = rest.split_at_checked(4 * counts[3])?;
+    tin.errors = errors.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
+    let (needs, mut rest) = rest.split_at_checked(2 * counts[4])?;
+    tin.needs = needs.as_chunks::<2>().0.iter().map(|b| u16::from_le_bytes(*b)).collect();
     let mut numbers = |count: usize| {
         let (now, later) = rest.split_at_checked(4 * count)?;
         rest = later;
         Some(now.as_chunks::<4>().0.iter().map(|b| u32::from_le_bytes(*b)))
     };
-    tin.errors = numbers(counts[3])?.map(f32::from_bits).collect();
     for _ in 0..counts[2] {
         let head: Vec<u32> = numbers(3)?.collect();
         let flat: Vec<u32> = numbers(2 * head[2] as usize)?.collect();
@@ -203,6 +211,7 @@ mod tests {
             triangles: vec![[0, 1, vertices - 1], [2, 1, 0]],
             borders: vec![([0, 1], vec![[5, 6], [7, 8]]), ([1, 2], vec![])],
             errors: vec![0.5, 7.25],
+            needs: (0..vertices).map(|i| u16::try_from(i % 7).unwrap()).collect(),
             lost: 12.5,
         }
     }
