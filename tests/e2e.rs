@@ -49,6 +49,8 @@ mod resume;
 mod rough;
 /// Law 2: any cut of a built store, with anything missing, has no cracks.
 mod seams;
+/// Water that changes with time: built of many files, drawn at a time, and refused.
+mod series;
 /// What an operator relies on: headers, counters, logs, encryption, tokens, rates, settings.
 mod service;
 /// Streaming from end to end: pictures, bytes, flights with late data.

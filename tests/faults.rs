@@ -9,7 +9,7 @@ use crate::stream::{over_magenta, sharp};
 use crate::swap::{drawn, publish};
 use crate::world::{Served, World, build, options, programs, serve, write_raw};
 use diamantina_client::camera::Camera;
-use diamantina_client::headless::{self, Flight, FlightPath, PathKey};
+use diamantina_client::headless::{self, Flight, FlightPath, PathKey, Play};
 use diamantina_client::picture::Picture;
 use diamantina_client::terrain::{self, Terrain};
 use std::path::{Path, PathBuf};
@@ -163,6 +163,7 @@ fn a_flight_goes_on_while_its_server_ends_and_its_scene_is_replaced() {
     let mut terrain = terrain(&address);
     let path = descent();
     let flight = Flight {
+        play: Play::default(),
         frames: FRAMES,
         frames_a_second: 30.0,
         size: SIZE,

@@ -36,7 +36,7 @@ const EPSG: u32 = 32723;
 const SEA_CELL: f64 = 70.0;
 
 /// Writes an Arc ASCII grid with the centre of its south-west sample at `origin`; it says nothing of its CRS.
-fn write_asc(
+pub(crate) fn write_asc(
     path: &Path,
     [width, height]: [u32; 2],
     [x, y]: [f64; 2],
@@ -360,7 +360,7 @@ fn a_picture_shows_the_layers_that_are_asked_for_and_no_others() {
 }
 
 /// The pixels of a PNG.
-fn pixels(path: &Path) -> Vec<u8> {
+pub(crate) fn pixels(path: &Path) -> Vec<u8> {
     let mut reader =
         png::Decoder::new(std::io::BufReader::new(std::fs::File::open(path).unwrap())).read_info().unwrap();
     let mut pixels = vec![0; reader.output_buffer_size().unwrap()];

@@ -3,7 +3,7 @@
 use crate::world::{Faults, Proxy, World, build, data, options, programs, serve};
 use diamantina_client::camera::{Camera, FOV_Y};
 use diamantina_client::encoding::Encoding;
-use diamantina_client::headless::{self, Flight, FlightPath, PathKey};
+use diamantina_client::headless::{self, Flight, FlightPath, PathKey, Play};
 use diamantina_client::render::{self, Background, Look};
 use diamantina_client::terrain::{self, Terrain};
 use diamantina_server::{hierarchy, ingest};
@@ -147,6 +147,7 @@ pub(crate) fn fly_over_magenta(
     let mut terrain = Terrain::open(&format!("{}/scenes/world", proxy.address), options).unwrap();
     let path = steep_flight(terrain.scene());
     let flight = Flight {
+        play: Play::default(),
         frames: 300,
         frames_a_second: 30.0,
         size: [160, 120],

@@ -16,7 +16,8 @@ const PROTOCOL: &[(&str, &[&str])] = &[
     ("projection", &["message"]),
     ("sight", &["bintree"]),
     ("texture", &[]),
-    ("message", &["bintree", "diamond", "points", "texture", "wire", "zone"]),
+    ("series", &[]),
+    ("message", &["bintree", "diamond", "points", "series", "texture", "wire", "zone"]),
     ("zone", &["bintree", "diamond"]),
     ("wire", &[]),
 ];
@@ -41,7 +42,8 @@ const SERVER: &[(&str, &[&str])] = &[
     ("http", &["height", "inspect", "size", "store", "stream"]),
     ("settings", &["http", "size"]),
     // What the program is told of layers, and what it prints.
-    ("layer_args", &[]),
+    ("series_args", &[]),
+    ("layer_args", &["series_args"]),
     ("arguments", &["layer_args"]),
     ("print", &["layer_args"]),
     ("sample", &[]),
@@ -81,11 +83,13 @@ const CLIENT: &[(&str, &[&str])] = &[
             "encoding",
             "fetch",
             "morph",
+            "player",
             "sight",
             "surface",
             "texture",
         ],
     ),
+    ("player", &[]),
     ("texture", &["background", "camera"]),
     ("render", &["camera", "drawing", "morph", "picture", "surface", "texture"]),
     ("controls", &["camera"]),
@@ -97,15 +101,15 @@ const CLIENT: &[(&str, &[&str])] = &[
     (
         "headless",
         &[
-            "annotate", "camera", "drawing", "fetch", "globe", "overview", "pick", "picture", "render",
-            "surface", "terrain",
+            "annotate", "camera", "drawing", "fetch", "globe", "overview", "pick", "picture", "player",
+            "render", "surface", "terrain",
         ],
     ),
     (
         "viewer",
         &[
             "annotate", "camera", "controls", "drawing", "encoding", "globe", "headless", "overview", "pick",
-            "picture", "render", "surface", "terrain", "texture",
+            "picture", "player", "render", "surface", "terrain", "texture",
         ],
     ),
     ("web", &["encoding", "fetch", "render", "terrain", "texture", "viewer"]),

@@ -26,6 +26,8 @@ pub struct Cache {
     forests: Vec<Forest>,
     budget_bytes: usize,
     bytes: usize,
+    /// Of each layer whether its roots stay, whatever the budget.
+    keeps_roots: Vec<bool>,
     /// Counts cuts. What was used at `now` is wanted by the last one.
     now: u64,
     held: HashMap<Key, Held, RandomState>,
@@ -44,7 +46,19 @@ impl Cache {
     /// that something can always be drawn.
     #[must_use]
     pub fn new(forests: Vec<Forest>, budget_bytes: usize) -> Self {
-        Self { forests, budget_bytes, bytes: 0, now: 1, held: HashMap::default() }
+        let keeps_roots = vec![true; forests.len()];
+        Self { forests, budget_bytes, bytes: 0, keeps_roots, now: 1, held: HashMap::default() }
+    }
+
+    /// Says whether the roots of a layer stay resident whatever the budget. Those of a layer that is not to be drawn for
+    /// now need not.
+    pub fn keep_roots(&mut self, layer: usize, keep: bool) {
+        self.keeps_roots[layer] = keep;
+    }
+
+    /// Whether a surface stays whatever is wanted: a root.
+    fn stays(&self, (layer, d): Key) -> bool {
+        d.level() == 0 && self.keeps_roots[layer]
     }
 
     /// The surface of a diamond, if it is resident.
@@ -97,7 +111,7 @@ impl Cache {
         } else {
             self.bytes + bytes <= self.budget_bytes
         };
-        if !room && d.level() > 0 {
+        if !room && !self.stays(key) {
             return false;
         }
         for parent in forest.parents(d) {
@@ -136,7 +150,7 @@ impl Cache {
         let mut leaves: BinaryHeap<Reverse<(u64, Key)>> = self
             .held
             .iter()
-            .filter(|(key, held)| held.children == 0 && held.used < self.now && key.1.level() > 0)
+            .filter(|(key, held)| held.children == 0 && held.used < self.now && !self.stays(**key))
             .map(|(key, held)| Reverse((held.used, *key)))
             .collect();
         while self.bytes > goal {
@@ -146,9 +160,10 @@ impl Cache {
             let Some(held) = self.held.remove(&key) else { continue };
             self.bytes -= held.surface.bytes(&forest, d);
             for parent in forest.parents(d) {
+                let stays = self.stays((layer, parent));
                 let Some(held) = self.held.get_mut(&(layer, parent)) else { continue };
                 held.children -= 1;
-                if held.children == 0 && held.used < self.now && parent.level() > 0 {
+                if held.children == 0 && held.used < self.now && !stays {
                     leaves.push(Reverse((held.used, (layer, parent))));
                 }
             }
@@ -301,6 +316,31 @@ mod tests {
         let child = built.layer.forest.diamonds(1).next().unwrap();
         assert!(!cache.insert((0, child), Arc::clone(&all[&child]), true));
         assert_eq!(cache.len(), 2);
+    }
+
+    #[test]
+    fn roots_of_a_layer_that_is_not_drawn_make_room_for_what_is() {
+        let built = &world()[0];
+        let forest = built.layer.forest;
+        let all = surfaces(built, |d| d.level() < 2);
+        let roots: Vec<Diamond> = forest.root_diamonds().collect();
+        let size = all[&roots[0]].bytes(&forest, roots[0]);
+        let mut cache = Cache::new(vec![forest; 3], 2 * size);
+        // Two roots of each: those of the first are wanted, those of the second were.
+        for layer in [1, 0] {
+            cache.want(std::iter::empty());
+            for d in &roots {
+                assert!(cache.insert((layer, *d), Arc::clone(&all[d]), true), "roots always find room");
+            }
+        }
+        assert_eq!(cache.len(), 4);
+        cache.keep_roots(1, false);
+        cache.keep_roots(2, false);
+        assert!(!cache.insert((2, roots[0]), Arc::clone(&all[&roots[0]]), false), "not beyond the budget");
+        cache.want(roots.iter().map(|d| (0, *d)));
+        let child = forest.diamonds(1).next().unwrap();
+        let _ = cache.insert((0, child), Arc::clone(&all[&child]), true);
+        assert!(roots.iter().all(|d| cache.get((0, *d)).is_some() && cache.get((1, *d)).is_none()));
     }
 
     #[test]

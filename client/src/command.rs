@@ -5,6 +5,7 @@ mod keep;
 mod load;
 mod look;
 mod size;
+mod time;
 
 use annotate::AnnotateArgs;
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -28,6 +29,7 @@ use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
+use time::{PlayArgs, TimeArgs};
 
 /// Seconds that points move in a window.
 const MORPH_SECONDS: f64 = 0.3;
@@ -88,7 +90,8 @@ struct ViewerArgs {
 #[derive(Args, Clone)]
 struct ViewArgs {
     /// The server, or one of its scenes: http://HOST:PORT or http://HOST:PORT/scenes/NAME, or as a browser has it,
-    /// http://HOST:PORT/?scene=NAME; for `view` also with #x,y,z,heading,pitch
+    /// http://HOST:PORT/?scene=NAME; for `view` also with #x,y,z,heading,pitch, or with ,seconds behind where water
+    /// changes with time
     url: String,
     #[command(flatten)]
     token: TokenArgs,
@@ -133,6 +136,8 @@ struct ViewArgs {
     /// pictures that a frame is made of come on top: some 36 bytes a pixel, 8 with --no-antialias, and with water 16 more
     #[arg(long, default_value = "512MiB", value_name = "SIZE", value_parser = parse_bytes)]
     gpu_memory: u64,
+    #[command(flatten)]
+    time: TimeArgs,
     #[command(flatten)]
     keep: KeepArgs,
     #[command(flatten)]
@@ -205,6 +210,8 @@ struct FlyArgs {
     /// Seconds of the path that the surface takes to move whenever its level of detail changes, up to 60; 0: it jumps
     #[arg(long, default_value_t = 0.0, value_name = "SECONDS")]
     morph: f64,
+    #[command(flatten)]
+    play: PlayArgs,
     /// Write a line for each frame here (- for standard output)
     #[arg(long, value_name = "CSV")]
     csv: Option<PathBuf>,
@@ -330,6 +337,7 @@ impl ViewArgs {
                 ..fetch::Options::default()
             },
             layers: self.layers.clone(),
+            time: self.time.seconds(),
             zone: self.zone.clone(),
             // Colours tell heights, unless a picture is asked for.
             imagery: match &self.texture {
@@ -354,6 +362,7 @@ impl ViewArgs {
             );
             Failure(if wrong_use { 2 } else { 1 }, error.to_string())
         })?;
+        self.time.check(&terrain)?;
         tell_offline(&terrain);
         Ok(terrain)
     }
@@ -457,7 +466,7 @@ fn view(args: &ViewerArgs) -> Result<(), Failure> {
     }
     let (url, at) = match args.view.url.split_once('#') {
         Some((url, view)) => {
-            let expected = "expected #x,y,z,heading,pitch, metres and degrees, as `Copy view` gives it";
+            let expected = "expected #x,y,z,heading,pitch, metres and degrees, or with ,seconds behind, as `Copy view` gives it";
             let camera = viewer::camera_at(view, args.view.size);
             (url.to_owned(), Some(camera.ok_or_else(|| Failure(2, format!("#{view}: {expected}")))?))
         }
@@ -468,7 +477,10 @@ fn view(args: &ViewerArgs) -> Result<(), Failure> {
     let terrain = view.open(morph, kept.0.as_ref(), true)?;
     let look = view.look(&terrain);
     let title = format!("{} - Diamantina", terrain.scene().name);
-    let viewer = Viewer::new(terrain, &url, look, view.size, at);
+    let mut viewer = Viewer::new(terrain, &url, look, view.size, at);
+    if let Some((_, view)) = args.view.url.split_once('#') {
+        viewer.set_time_of(view);
+    }
     viewer::window::run(viewer, &title, &view.render_options()).map_err(|e| Failure(1, e.to_string()))
 }
 
@@ -550,6 +562,7 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
         })?;
     }
     let flight = Flight {
+        play: args.play.play()?,
         frames: args.frames,
         frames_a_second: args.fps,
         size: args.view.size,

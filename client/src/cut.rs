@@ -136,6 +136,8 @@ pub struct Ideal {
     /// For each of the splits, the error in pixels of the triangles that no child has; 0 above the finest level.
     finest_pixels: Vec<f64>,
     is_limited: bool,
+    /// What the surfaces of the split diamonds are expected to take.
+    bytes: usize,
 }
 
 /// A diamond that was looked at.
@@ -262,6 +264,12 @@ impl Ideal {
         self.is_limited
     }
 
+    /// Bytes of memory that the surfaces of the split diamonds are expected to take.
+    #[must_use]
+    pub fn bytes(&self) -> usize {
+        self.bytes
+    }
+
     /// Pages of the index without which it is not known what to split, most urgent first.
     #[must_use]
     pub fn pages(&self) -> &[u32] {
@@ -305,6 +313,7 @@ pub fn choose(ask: &Ask, entry: impl Fn(Diamond) -> Option<Entry>) -> Ideal {
         }
     }
     let mut ideal = chooser.ideal;
+    ideal.bytes = chooser.spent_bytes;
     // Whoever is needed is as urgent as who needs it; children come later in the list.
     for at in (0..ideal.splits.len()).rev() {
         let Node { parents, priority, .. } = *ideal.node(ideal.splits[at]);

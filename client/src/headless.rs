@@ -7,6 +7,7 @@ use crate::globe::Globe;
 use crate::overview::{around, stretched};
 use crate::pick::Picker;
 use crate::picture::{Picture, write_png};
+use crate::player::{self, Course};
 use crate::render::{self, FrameStats, Look, Offscreen, RenderError};
 use crate::surface::Surface;
 use crate::terrain::{FrameView, Stats, Terrain, TerrainError};
@@ -104,7 +105,10 @@ pub fn framed(terrain: &mut Terrain, size: [u32; 2], exaggeration: f64, patience
     };
     let layers = &terrain.scene().layers;
     let mut points = Vec::new();
-    for item in &items {
+    // Whatever the time, it is seen from the same place.
+    let is_still = |item: &&DrawItem| !terrain.is_step(item.layer);
+    let is_any_still = items.iter().any(|item| is_still(&item));
+    for item in items.iter().filter(|item| !is_any_still || is_still(item)) {
         let layer = &layers[item.layer];
         match &*item.surface {
             Surface::Points(here) => points.extend(points_of(layer, item.diamond, here.block())),
@@ -185,6 +189,8 @@ pub struct PictureReport {
     pub texture: Option<String>,
     /// Tiles of it that arrived.
     pub texture_tiles: usize,
+    /// The time of water that changes with it, in seconds; `null` where there is none.
+    pub time_seconds: Option<f64>,
     /// Whether all that was wanted arrived.
     pub complete: bool,
     /// Whether the largest error is within the asked one. Where all has arrived and it is not, the scene has no more, or
@@ -272,7 +278,7 @@ impl Annotator {
         look: &Look,
     ) {
         let centre = annotate::centre(&mut self.picker, &terrain.scene().layers, items, look, camera);
-        let layers = terrain.shown_scene().layers;
+        let layers = terrain.drawn_layers();
         let subject = Subject { camera, look, layers: &layers, globe: self.globe.as_ref(), centre };
         offscreen.draw_over(annotate::pixels_per_point(camera.size), |painter, area| {
             annotate::show(painter, area, &subject);
@@ -314,6 +320,7 @@ fn report(
         zone_in_effect: view.stats.zone_in_effect,
         texture: terrain.texture().map(|number| terrain.scene().textures[number].name.clone()),
         texture_tiles: view.stats.texture_tiles,
+        time_seconds: (!terrain.scene().series.is_empty()).then(|| terrain.time()),
         complete: view.complete,
         asked_error_reached: view.error_pixels <= terrain.tolerance_pixels(),
         limited_by_memory: view.limited,
@@ -501,9 +508,20 @@ impl Dice {
     }
 }
 
+/// How water that changes with time goes on while a path is flown.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Play {
+    /// Seconds of it for a second of the path; below 0: backwards; 0: it stands.
+    pub speed: f64,
+    /// Whether it begins again after the last step.
+    pub is_round: bool,
+}
+
 /// How to fly.
 #[derive(Debug, Clone)]
 pub struct Flight {
+    /// How water that changes with time goes on, from the terrain's time.
+    pub play: Play,
     /// Frames to draw.
     pub frames: u32,
     /// Frames a second at most; 0: as fast as they can be drawn.
@@ -572,17 +590,23 @@ pub struct FrameLine {
     pub offline: bool,
     /// Whether memory, here or on the GPU, kept the ideal cut from the asked error.
     pub limited_by_memory: bool,
+    /// The time of water that changes with it, in seconds.
+    pub time_seconds: f64,
+    /// Series of which an earlier step was drawn, since that of this time had not arrived.
+    pub late: usize,
+    /// Steps of series that come next and were there already.
+    pub steps_ahead: usize,
 }
 
 impl FrameLine {
     /// The heading of the CSV.
-    pub const HEADING: &str = "frame,seconds,cut_ms,draw_ms,error_pixels,goal_pixels,complete,moving,diamonds,triangles,draws,uploaded_bytes,gpu_bytes,resident,resident_bytes,bytes,requests,round_trips,real_points,fictitious_points,zone_in_effect,gpu_fixed_bytes,disk_bytes,offline,limited_by_memory";
+    pub const HEADING: &str = "frame,seconds,cut_ms,draw_ms,error_pixels,goal_pixels,complete,moving,diamonds,triangles,draws,uploaded_bytes,gpu_bytes,resident,resident_bytes,bytes,requests,round_trips,real_points,fictitious_points,zone_in_effect,gpu_fixed_bytes,disk_bytes,offline,limited_by_memory,time_seconds,late,steps_ahead";
 
     /// The line, with the fields of the heading.
     #[must_use]
     pub fn csv(&self) -> String {
         format!(
-            "{},{:.4},{:.3},{:.3},{:.4},{:.4},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+            "{},{:.4},{:.3},{:.3},{:.4},{:.4},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{:.4},{},{}",
             self.frame,
             self.seconds,
             self.cut_ms,
@@ -608,6 +632,9 @@ impl FrameLine {
             self.disk_bytes,
             self.offline,
             self.limited_by_memory,
+            self.time_seconds,
+            self.late,
+            self.steps_ahead,
         )
     }
 }
@@ -633,6 +660,9 @@ pub fn fly(
     let mut annotator: Option<(String, Annotator)> = None;
     terrain.set_wires(look.wireframe);
     terrain.set_mirrors(look.mirrors().then_some(look.water.mirror_error));
+    let (play, from) = (flight.play, terrain.time());
+    let is_playing = play.speed != 0.0;
+    let course = is_playing.then_some(Course { is_backward: play.speed < 0.0, is_round: play.is_round });
     let started = Instant::now();
     for frame in 0..flight.frames {
         if flight.frames_a_second > 0.0 {
@@ -644,6 +674,11 @@ pub fn fly(
         let clock = Instant::now();
         let drawn = stretched(&camera, look.exaggeration);
         let seconds = part * path.seconds();
+        if is_playing {
+            // It follows the path and waits for nothing: flights can be compared.
+            let time = player::time_at(&terrain.scene().series, from, seconds, play.speed, play.is_round);
+            terrain.set_time(time, course);
+        }
         if let Some(patience) = flight.patience {
             terrain.settle_at(&drawn, seconds, patience);
         }
@@ -698,6 +733,9 @@ pub fn fly(
             disk_bytes: view.stats.traffic.disk_bytes,
             offline: view.stats.offline,
             limited_by_memory: view.limited,
+            time_seconds: terrain.time(),
+            late: view.late,
+            steps_ahead: view.stats.steps_ahead,
         };
         if let (Some(folder), Some(picture)) = (&flight.pictures, &picture) {
             save(picture, &folder.join(format!("frame-{frame:05}.png")))?;
@@ -801,6 +839,9 @@ mod tests {
             disk_bytes: 14,
             offline: false,
             limited_by_memory: true,
+            time_seconds: 14.5,
+            late: 1,
+            steps_ahead: 2,
         };
         assert_eq!(line.csv().split(',').count(), FrameLine::HEADING.split(',').count());
         let json = serde_json::to_value(&line).unwrap();

@@ -20,6 +20,7 @@
 //! | [`globe`] | where the frame lies on the globe: longitudes, true north, true lengths |
 //! | [`annotate`] | scale bar, north arrow and legend over a picture |
 //! | [`picture`] | pixels → PNG |
+//! | [`player`] | the clock of series of water surfaces |
 //! | [`overview`] | where a whole scene is seen from |
 //! | [`headless`] | pictures and flights without a window |
 //! | `load` | many users at once, to see what a server bears |
@@ -53,6 +54,7 @@ pub mod morph;
 pub mod overview;
 pub mod pick;
 pub mod picture;
+pub mod player;
 pub mod render;
 pub mod sight;
 pub mod surface;

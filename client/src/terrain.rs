@@ -12,7 +12,8 @@
 //! surfaces are there; the decoding threads hold it till then and go on from parent to child by
 //! themselves, so a whole branch that arrived in one answer is decoded between two frames.
 //!
-//! A scene that is replaced on the server while it is looked at is opened again by itself: see `reload`.
+//! A scene that is replaced on the server while it is looked at is opened again by itself: see `reload`. Of a series of
+//! water surfaces in time one is drawn, and the next are fetched ahead: see `steps`.
 
 mod decoders;
 mod imagery;
@@ -21,6 +22,7 @@ mod options;
 mod reload;
 mod shares;
 mod shown;
+mod steps;
 mod view;
 
 use crate::cache::{Cache, Index, Key};
@@ -47,6 +49,8 @@ use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 #[cfg(not(target_arch = "wasm32"))]
 use std::time::Duration;
+pub use steps::AHEAD_MAX;
+use steps::{Role, Steps};
 use view::ZoneView;
 use web_time::Instant;
 
@@ -95,6 +99,8 @@ pub struct Stats {
     pub offline: bool,
     /// Whether the last frame's eye was in the zone that was asked for.
     pub zone_in_effect: bool,
+    /// Steps of series that come next and are there already, as the view wants them.
+    pub steps_ahead: usize,
     /// Seconds from opening to the first frame that drew something.
     pub first_picture_seconds: Option<f64>,
     /// Seconds from opening to the first frame whose error was within the tolerance.
@@ -124,6 +130,8 @@ pub struct FrameView {
     pub complete: bool,
     /// Whether memory, here or on the GPU, keeps the ideal cut from the tolerance.
     pub limited: bool,
+    /// Series of which an earlier step is drawn, since that of the present time has not arrived.
+    pub late: usize,
     /// Diamonds in motion, or about to be, and tiles of imagery: the next frame looks different, even if nothing arrives. The error counts
     /// them as not yet split.
     pub moving: usize,
@@ -174,6 +182,7 @@ pub struct Terrain {
     stats: Stats,
     view: Option<ZoneView>,
     draping: Option<Draping>,
+    steps: Steps,
 }
 
 #[derive(Debug)]
@@ -189,8 +198,16 @@ struct LayerState {
     /// Pages of the index that are kept beyond those in use.
     pages_max: usize,
     morphs: Morphs,
-    /// Whether it is streamed and drawn.
+    /// Whether it is streamed and drawn, or in its turn if it is a step.
     shown: bool,
+    /// What it is for, of a series.
+    role: Role,
+    /// What is wanted ahead of it, once it has been looked at.
+    ahead: Option<Vec<Wish>>,
+    /// Whether some of that is missing.
+    lacks: bool,
+    /// Whether another step was drawn before it: nothing of it moves in its first frame.
+    appears: bool,
 }
 
 impl Terrain {
@@ -245,6 +262,10 @@ impl Terrain {
             pages_max: 0,
             morphs: Morphs::new(options.morph_seconds),
             shown: true,
+            role: Role::Drawn,
+            ahead: None,
+            lacks: true,
+            appears: false,
         };
         let layers = scene.layers.iter().map(state).collect();
         let forests: Vec<_> = scene.layers.iter().map(|layer| layer.forest).collect();
@@ -253,6 +274,7 @@ impl Terrain {
         let scene = Arc::new(scene);
         let shown = options.layers.clone();
         let morph_seconds = options.morph_seconds;
+        let steps = Steps::of(&scene, options.time);
         let mut terrain = Self {
             url: fetcher.address(),
             layers,
@@ -280,7 +302,9 @@ impl Terrain {
             stats: Stats::default(),
             view,
             draping: None,
+            steps,
         };
+        terrain.turn_steps();
         terrain.draping = texture.map(|number| terrain.drape(number)).transpose()?;
         terrain.show_only(shown);
         Ok(terrain)
@@ -398,7 +422,8 @@ impl Terrain {
         let sides = camera.planes().iter().map(flat).collect();
         let eye = camera.eye.with_z(camera.eye.z / exaggeration).to_array();
         let view = StreamView { eye, angle, sides, vertical: self.options.sight.vertical };
-        for layer in (0..self.layers.len()).filter(|layer| self.layers[*layer].shown) {
+        let is_asked = |layer: &usize| self.layers[*layer].shown && self.steps.is_wanted(*layer);
+        for layer in (0..self.layers.len()).filter(is_asked) {
             self.fetcher.stream(layer, StreamAsk { view: Some(view.clone()), ..StreamAsk::default() });
         }
         self.strays = 0;
@@ -429,6 +454,7 @@ impl Terrain {
         self.take_decoded();
         self.take_tiles();
         let arrived = self.take_fetched();
+        self.turn_steps();
         // What comes of another version is still to come.
         let mut view = FrameView { complete: !self.is_leaving(), ..FrameView::default() };
         let mut wishes = Vec::new();
@@ -439,7 +465,9 @@ impl Terrain {
         self.stats.zone_in_effect = zone.is_some();
         let tolerance = self.options.tolerance_pixels / camera.pixels_per_radian();
         let [parts, own] = self.beside_mirrors();
-        for (number, state) in self.layers.iter_mut().enumerate().filter(|(_, state)| state.shown) {
+        for (number, role) in self.steps.order(&self.layers) {
+            let memory_bytes = self.steps.room(number, &self.layers) / parts * own;
+            let state = &mut self.layers[number];
             let gpu_bytes_of = |d| self.cache.get((number, d)).map(|surface| surface.gpu_bytes(self.wires));
             // What moves is drawn beside what it becomes.
             let gpu_bytes = state.gpu_bytes / parts as u64 * own as u64;
@@ -452,28 +480,43 @@ impl Terrain {
                 tolerance_pixels: self.options.tolerance_pixels,
                 sight: self.options.sight,
                 seen: zone.map(|zone| zone.seen(number, tolerance)),
-                memory_bytes: state.memory_bytes / parts * own,
+                memory_bytes,
                 gpu: Some(Gpu { bytes: gpu_bytes, of: &gpu_bytes_of }),
             };
             state.ideal = cut::choose(&ask, |d| state.index.get(d));
             let surface = |d| self.cache.get((number, d)).cloned();
             let mut drawing = cut::draw(number, &ask, &state.ideal, surface);
+            let mirrored = state.mirrored.iter().flat_map(Ideal::seen);
+            state.index.trim(state.pages_max, state.ideal.seen().chain(mirrored));
+            if role == Role::Ahead {
+                state.ahead = Some(drawing.wishes);
+                continue;
+            }
+            if role == Role::Stays {
+                // What it lacks by now is not worth fetching.
+                drawing.wishes.clear();
+            } else {
+                view.complete &= drawing.wishes.is_empty() && state.ideal.pages().is_empty();
+                view.limited |= state.ideal.is_limited();
+                view.error_pixels_goal = view.error_pixels_goal.max(drawing.error_pixels_goal);
+            }
+            wishes.extend(drawing.wishes.drain(..).map(|wish| (number, wish)));
+            if role == Role::Awaited {
+                view.late += 1;
+                continue;
+            }
             if state.morphs.is_on() {
-                let last = self.planes.as_ref();
+                let last = if state.appears { None } else { self.planes.as_ref() };
+                state.appears = false;
                 view.moving += state.move_on(&ask, number, now, &surface, last, self.wires, &mut drawing);
             }
             self.stats.splits_ideal += state.ideal.len();
             self.stats.splits_drawn += drawing.splits.len();
             view.items.extend(drawing.items);
             view.error_pixels = view.error_pixels.max(drawing.error_pixels);
-            view.error_pixels_goal = view.error_pixels_goal.max(drawing.error_pixels_goal);
-            view.limited |= state.ideal.is_limited();
-            view.complete &= drawing.wishes.is_empty() && state.ideal.pages().is_empty();
-            wishes.extend(drawing.wishes.into_iter().map(|wish| (number, wish)));
-            let mirrored = state.mirrored.iter().flat_map(Ideal::seen);
-            state.index.trim(state.pages_max, state.ideal.seen().chain(mirrored));
         }
         self.mirror(camera, &mut view, &mut wishes);
+        self.fit_ahead();
         self.planes = Some(camera.planes());
         self.judge_streams(&arrived);
         let layers = self.layers.iter().enumerate();
@@ -489,7 +532,8 @@ impl Terrain {
     #[cfg(not(target_arch = "wasm32"))]
     pub(crate) fn drawn_at(&self, camera: &Camera, tolerance_pixels: f64) -> Option<Vec<DrawItem>> {
         let mut items = Vec::new();
-        for (number, state) in self.layers.iter().enumerate() {
+        let drawn = |(_, state): &(usize, &LayerState)| matches!(state.role, Role::Drawn | Role::Stays);
+        for (number, state) in self.layers.iter().enumerate().filter(drawn) {
             let ask = Ask {
                 layer: &self.scene.layers[number],
                 encoding: self.options.fetch.encoding,
@@ -653,7 +697,8 @@ impl Terrain {
         while let Some((number, wish)) = payloads.next_if(|(_, wish)| wish.diamond.level() == 0) {
             self.want((number, wish), &mut wants, &mut room);
         }
-        for (number, state) in self.layers.iter().enumerate() {
+        let asked = |(_, state): &(usize, &LayerState)| matches!(state.role, Role::Drawn | Role::Awaited);
+        for (number, state) in self.layers.iter().enumerate().filter(asked) {
             let mirrored = state.mirrored.iter().flat_map(Ideal::pages);
             let pages = state.ideal.pages().iter().chain(mirrored);
             wants.extend(pages.map(|p| Want { key: fetch::Key::Page(number, *p), bytes: None }));
@@ -665,7 +710,9 @@ impl Terrain {
             }
             self.want(wish, &mut wants, &mut room);
         }
-        self.fetcher.wish(wants);
+        let pressing = wants.len();
+        self.want_ahead(&mut wants, &mut room);
+        self.fetcher.wish_ahead(wants, pressing);
     }
 
     fn want(&mut self, (number, wish): (usize, Wish), wants: &mut Vec<Want>, room: &mut usize) {
@@ -700,6 +747,7 @@ impl Terrain {
         self.stats.resident_bytes = self.cache.bytes();
         self.stats.pages = self.layers.iter().map(|state| state.index.pages()).sum();
         self.stats.decoding = self.pending.len();
+        self.stats.steps_ahead = self.steps_ahead();
         self.stats.failed = self.failed.len();
         self.stats.offline = self.fetcher.is_away();
         self.stats.frame_seconds = started.elapsed().as_secs_f64();

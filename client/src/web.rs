@@ -1,7 +1,7 @@
 //! The viewer on a page, in a canvas.
 //!
-//! The page is that of a server: its address, `?scene=NAME`, says what to open; `#x,y,z,heading,pitch` where to begin,
-//! and follows the view, so that it can be kept, sent and opened again, in a native window too. Further words of the
+//! The page is that of a server: its address, `?scene=NAME`, says what to open; `#x,y,z,heading,pitch` (and `,seconds` of water that
+//! changes with time) where to begin, and follows the view, so that it can be kept, sent and opened again, in a native window too. Further words of the
 //! query: `error=PIXELS`, `encoding=points|tin`, `zone=NAME`, `layer=NAME,NAME` (those alone), `graphics=webgl` (where WebGPU is there, but does not work).
 //!
 //! What the page shows besides the canvas, it shows by its own means: see `web/` beside this crate.
@@ -66,6 +66,10 @@ struct State {
     longest_frame_milliseconds: f64,
     /// What was clicked: x, y and height in metres, and how far the height may be off.
     marks: Vec<([f64; 3], Option<f64>)>,
+    /// The time of water that changes with it, in seconds, and whether it runs and waits for data.
+    time: f64,
+    plays: bool,
+    waits: bool,
     problem: Option<String>,
 }
 
@@ -119,6 +123,7 @@ fn options(address: &Address) -> Result<terrain::Options, String> {
         fade_seconds: FADE_SECONDS,
         layers: address.asked("layer").map(|names| names.split(',').map(str::to_owned).collect()),
         zone: address.asked("zone"),
+        time: viewer::time_at(&address.view).unwrap_or(0.0),
         imagery: Imagery::asked(address.asked("texture")),
         fetch: fetch::Options { encoding, ..fetch::Options::default() },
         ..terrain::Options::default()
@@ -197,10 +202,8 @@ impl Shown {
         let display = Rc::clone(&self.display);
         let mut display = display.borrow_mut();
         let Some(display) = display.as_mut() else { return };
-        if let Some(view) = self.page.take_changed_view()
-            && let Some(camera) = viewer::camera_at(&view, self.viewer.camera().size)
-        {
-            self.viewer.fly_to(&camera);
+        if let Some(view) = self.page.take_changed_view() {
+            self.viewer.go_to(&view);
         }
         let began = Instant::now();
         let wait = display.draw(&mut self.viewer, !self.wants_picture);
@@ -266,6 +269,9 @@ impl Shown {
                 requests: frame.stats.traffic.requests,
                 longest_frame_milliseconds: self.longest.as_secs_f64() * 1e3,
                 marks: self.viewer.marks().iter().map(|mark| (mark.place.to_array(), mark.error)).collect(),
+                time: self.viewer.player().seconds,
+                plays: self.viewer.player().plays,
+                waits: self.viewer.player().waits,
                 problem: terrain.problem().map(str::to_owned),
             };
         });

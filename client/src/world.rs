@@ -18,6 +18,7 @@ use diamantina_protocol::message::{
     self, Catalogue, Frame, FrameHeader, Kind, Layer, Scene, Status, StreamAsk, TinLayer,
 };
 use diamantina_protocol::points::{self, Coding, Rule};
+use diamantina_protocol::series::Series;
 use diamantina_protocol::sight;
 use diamantina_protocol::tin::{self, Patch};
 use glam::DVec3;
@@ -92,11 +93,23 @@ fn pond(x: u32, y: u32) -> i32 {
     if (f64::from(x) - 150.0).hypot(f64::from(y) - 100.0) < 40.0 { 2900 + (x / 8) as i32 } else { NODATA }
 }
 
+/// A wave that is farther in the east with each step, over all of the west.
+fn wave<const STEP: u32>(x: u32, y: u32) -> i32 {
+    let from_crest = (f64::from(x) - 20.0 - 25.0 * f64::from(STEP)) / 8.0;
+    3000 + (600.0 * (-from_crest * from_crest).exp() * (1.0 + f64::from(y) / 200.0)) as i32
+}
+
+/// Steps of the series of waves.
+pub(crate) const WAVES: usize = 4;
+
+/// Layers before the first of them.
+pub(crate) const BEFORE_WAVES: usize = 2;
+
 fn forest(root_log2: u8, patch_log2: u8, roots: [u32; 2], precision: u8) -> Forest {
     Forest::new(root_log2, patch_log2, roots).unwrap().with_precision(precision).unwrap()
 }
 
-/// The scene, made once: terrain of 1024 x 512 cells with two root squares, and a pond.
+/// The scene, made once: terrain of 1024 x 512 cells with two root squares, a pond, and the steps of a series of waves.
 pub(crate) fn world() -> &'static [Built] {
     static WORLD: OnceLock<Vec<Built>> = OnceLock::new();
     WORLD.get_or_init(|| {
@@ -107,11 +120,18 @@ pub(crate) fn world() -> &'static [Built] {
                 blocks,
             ),
             build("water", Kind::Water, forest(9, 3, [1, 1], 1), [10.0, 10.0], pond),
+            build("waves.0", Kind::Water, forest(7, 3, [1, 1], 0), [40.0, 40.0], wave::<0>),
+            build("waves.1", Kind::Water, forest(7, 3, [1, 1], 0), [40.0, 40.0], wave::<1>),
+            build("waves.2", Kind::Water, forest(7, 3, [1, 1], 0), [40.0, 40.0], wave::<2>),
+            build("waves.3", Kind::Water, forest(7, 3, [1, 1], 0), [40.0, 40.0], wave::<3>),
         ]
     })
 }
 
+/// So many layers of it; those beyond terrain and pond are a series, with a step each 10 seconds.
 pub(crate) fn scene(layers: usize) -> Scene {
+    let waves = world()[..layers].iter().skip(BEFORE_WAVES).map(|built| built.layer.name.clone());
+    let waves = Series { name: "waves".into(), layers: waves.collect(), step_seconds: 10.0 };
     Scene {
         name: "hills".into(),
         version: "v1".into(),
@@ -119,6 +139,7 @@ pub(crate) fn scene(layers: usize) -> Scene {
         layers: world()[..layers].iter().map(|built| built.layer.clone()).collect(),
         zones: Vec::new(),
         textures: Vec::new(),
+        series: if waves.layers.is_empty() { Vec::new() } else { vec![waves] },
     }
 }
 

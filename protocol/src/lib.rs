@@ -14,6 +14,7 @@
 //! | `projection` | longitude and latitude ⇄ the coordinates of a reference system (where the feature of this name is on) |
 //! | [`sight`] | how large an error of heights looks |
 //! | [`message`] | routes, catalogue, batch frames |
+//! | [`series`] | a surface at several times, of which each is a layer |
 //! | [`texture`] | imagery: a pyramid of tiles, and which of them there are |
 //! | [`zone`] | regions where the viewer stays, and how much of each diamond is seen from there |
 //! | [`wire`] | the one place that knows the serialisation crate |
@@ -32,6 +33,7 @@ pub mod points;
 #[cfg(feature = "projection")]
 pub mod projection;
 pub mod rans;
+pub mod series;
 pub mod sight;
 pub mod texture;
 pub mod tin;

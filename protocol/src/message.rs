@@ -10,6 +10,7 @@
 
 use crate::bintree::{Forest, Point};
 use crate::points::Coding;
+use crate::series::Series;
 use crate::texture::{Texture, Tile};
 use crate::wire::{self, WireError};
 use crate::zone::Zone;
@@ -49,6 +50,32 @@ pub struct Scene {
     /// Imagery draped on the terrain. No name of these is a layer's.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub textures: Vec<Texture>,
+    /// Surfaces at several times. Each step is one of the layers.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub series: Vec<Series>,
+}
+
+impl Scene {
+    /// The name by which users choose a layer: its own or, of a step, that of its series.
+    #[must_use]
+    pub fn chosen_as<'a>(&'a self, layer: &'a str) -> &'a str {
+        let series = self.series.iter().find(|series| series.layers.iter().any(|step| step == layer));
+        series.map_or(layer, |series| &series.name)
+    }
+
+    /// The names by which users choose layers, each once, in the order of layers.
+    #[must_use]
+    pub fn choices(&self) -> Vec<&str> {
+        let mut names: Vec<&str> = Vec::new();
+        for layer in &self.layers {
+            let name = self.chosen_as(&layer.name);
+            // At most 255 layers: looking through them is quick.
+            if !names.contains(&name) {
+                names.push(name);
+            }
+        }
+        names
+    }
 }
 
 /// The planar coordinate system of a scene. Coordinates are metres, x east, y north, heights up.

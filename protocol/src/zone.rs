@@ -36,8 +36,8 @@ pub const FORMAT: u8 = 1;
 /// The most diamonds whose visibility is kept, over all layers: one byte each, 64 MiB.
 pub const DIAMONDS_MAX: u64 = 1 << 26;
 
-/// The most layers of a mask.
-pub const LAYERS_MAX: usize = 64;
+/// The most layers of a scene, the steps of its series among them: a byte tells their number.
+pub const LAYERS_MAX: usize = 255;
 
 /// The most zones of a scene.
 pub const ZONES_MAX: usize = 64;

@@ -51,11 +51,15 @@ pub(super) struct BuildArgs {
     #[arg(required_unless_present = "layers", value_name = "DEM")]
     pub(super) sources: Vec<PathBuf>,
     /// Another layer: NAME=terrain:DEM or NAME=water:DEM (there is water where the file has heights), or flat water over
-    /// the first terrain: NAME=water:level=METRES; or imagery draped on the terrain, NAME=texture:PICTURE, as GeoTIFF, PNG
+    /// the first terrain: NAME=water:level=METRES; or water that changes with time, a file a step in the order of their
+    /// numbers: NAME=water:'wave_*.tif', in quotes; or imagery draped on the terrain, NAME=texture:PICTURE, as GeoTIFF, PNG
     /// or JPEG with a world file. Said again with the same name it adds a file. The first layer decides
     /// the frame, to which others are resampled; what is said of files holds for those of all layers
     #[arg(long = "layer", id = "layers", value_name = "NAME=KIND:FILE")]
     pub(super) layers: Vec<LayerArg>,
+    /// Seconds from a step to the next, of water that changes with time
+    #[arg(long, default_value_t = 1.0, value_name = "SECONDS", allow_negative_numbers = true)]
+    pub(super) step_seconds: f64,
     /// The folder of the store, or the address of an object store (s3://BUCKET/PREFIX, gs://..., az://...); an older
     /// scene there is replaced once the new one is complete
     #[arg(short, long, value_name = "STORE")]

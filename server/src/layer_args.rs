@@ -1,6 +1,8 @@
 //! The layers that `build` is told of on the command line.
 
+use crate::series_args;
 use diamantina_protocol::message::Kind;
+use diamantina_protocol::series::Series;
 use diamantina_server::hierarchy::LayerSource;
 use diamantina_server::ingest::{self, Grid, Imagery, IngestError, Source};
 use diamantina_server::texture::TextureSource;
@@ -13,7 +15,7 @@ pub(super) const TERRAIN: &str = "terrain";
 /// Characters of a layer's name, at most.
 const NAME_LENGTH_MAX: usize = 64;
 
-/// `NAME=KIND:PATH` or `NAME=water:level=METRES`.
+/// `NAME=KIND:PATH`, `NAME=water:PATTERN` or `NAME=water:level=METRES`.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct LayerArg {
     name: String,
@@ -41,6 +43,8 @@ impl What {
 #[derive(Debug, Clone, PartialEq)]
 enum Data {
     Files(Vec<PathBuf>),
+    /// A file for each step of a series, in the order of time.
+    Steps(Vec<PathBuf>),
     /// Metres, the same everywhere.
     Level(f64),
 }
@@ -95,11 +99,39 @@ impl FromStr for LayerArg {
     }
 }
 
+/// Finds the files of patterns: each makes a series of its layer.
+///
+/// # Errors
+/// When nothing matches, or the layer is not water.
+fn expand(layer: &LayerArg) -> Result<LayerArg, String> {
+    let pattern = match &layer.data {
+        Data::Files(files) => files.iter().find(|file| series_args::is_pattern(file)),
+        _ => None,
+    };
+    let Some(pattern) = pattern else { return Ok(layer.clone()) };
+    let (name, pattern) = (&layer.name, pattern.to_string_lossy());
+    if layer.what != What::Surface(Kind::Water) {
+        return Err(format!(
+            "--layer {name}: expected a file, found the pattern {pattern}: patterns are for water that changes with time; \
+             name each file of {} with a --layer of its own",
+            layer.what.word()
+        ));
+    }
+    let files = series_args::files(&pattern).map_err(|error| format!("--layer {name}: {error}"))?;
+    if series_args::step_name(name, files.len()).len() > NAME_LENGTH_MAX {
+        return Err(format!(
+            "--layer {name}: expected a shorter name, since steps are called NAME.0, NAME.1, ..., with {NAME_LENGTH_MAX} \
+             characters at most"
+        ));
+    }
+    Ok(LayerArg { data: Data::Steps(files), ..layer.clone() })
+}
+
 /// Puts together what belongs to one layer: first the files without a name, then the others in the order in which they are
 /// named.
 ///
 /// # Errors
-/// When one layer is said to be two things, or there is no terrain.
+/// When one layer is said to be two things, a pattern matches nothing, or there is no terrain.
 pub(super) fn join(files: &[PathBuf], named: &[LayerArg]) -> Result<Vec<LayerArg>, String> {
     let mut layers: Vec<LayerArg> = Vec::new();
     if !files.is_empty() {
@@ -107,8 +139,9 @@ pub(super) fn join(files: &[PathBuf], named: &[LayerArg]) -> Result<Vec<LayerArg
         layers.push(LayerArg { name: TERRAIN.to_owned(), what: What::Surface(Kind::Terrain), data });
     }
     for more in named {
+        let more = expand(more)?;
         let Some(layer) = layers.iter_mut().find(|layer| layer.name == more.name) else {
-            layers.push(more.clone());
+            layers.push(more);
             continue;
         };
         if layer.what != more.what {
@@ -123,6 +156,13 @@ pub(super) fn join(files: &[PathBuf], named: &[LayerArg]) -> Result<Vec<LayerArg
         }
         match (&mut layer.data, &more.data) {
             (Data::Files(all), Data::Files(files)) => all.extend_from_slice(files),
+            (Data::Steps(_), _) | (_, Data::Steps(_)) => {
+                return Err(format!(
+                    "--layer: '{}' is a series and something else besides: give one of both another name, or say one \
+                     pattern for all its files",
+                    more.name
+                ));
+            }
             _ => {
                 return Err(format!(
                     "--layer: '{}' has a level and something else besides: give one of both another name",
@@ -150,23 +190,68 @@ pub(super) fn word(kind: Kind) -> &'static str {
 
 /// The opened sources of layers, and pictures of textures.
 pub(super) struct Layers {
-    opened: Vec<(LayerArg, Kind, Source)>,
+    opened: Vec<Opened>,
     textures: Vec<(LayerArg, Imagery)>,
+    series: Vec<Series>,
+}
+
+/// A layer with its source.
+struct Opened {
+    name: String,
+    kind: Kind,
+    files: Vec<PathBuf>,
+    source: Source,
+}
+
+/// Why layers cannot be opened.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum OpenError {
+    /// A file cannot be read, or does not fit.
+    #[error(transparent)]
+    Ingest(#[from] IngestError),
+    /// The steps of a series are not of one surface.
+    #[error("--layer {series}: {what}")]
+    Steps {
+        /// The series.
+        series: String,
+        /// What is wrong.
+        what: String,
+    },
+}
+
+/// Each step of a series as a layer by itself; of other layers the layer.
+fn steps_of(layer: &LayerArg) -> Vec<LayerArg> {
+    let Data::Steps(files) = &layer.data else { return vec![layer.clone()] };
+    let step = |(step, file): (usize, &PathBuf)| LayerArg {
+        name: series_args::step_name(&layer.name, step),
+        what: layer.what,
+        data: Data::Files(vec![file.clone()]),
+    };
+    files.iter().enumerate().map(step).collect()
 }
 
 impl Layers {
     /// Opens the files of all layers. The first with files decides the frame. Flat water gets 2^`cells_log2` cells along each
-    /// side.
+    /// side, and series steps of `step_seconds`.
     ///
     /// # Errors
-    /// As [`ingest::open`] and [`ingest::open_over`].
+    /// As [`ingest::open`] and [`ingest::open_over`], and when the steps of a series lie elsewhere than its first.
     pub(super) fn open(
         layers: Vec<LayerArg>,
         options: &ingest::Options,
         cells_log2: u8,
-    ) -> Result<Self, IngestError> {
+        step_seconds: f64,
+    ) -> Result<Self, OpenError> {
         let (surfaces, pictures): (Vec<_>, Vec<_>) =
             layers.into_iter().partition(|layer| layer.what != What::Texture);
+        let is_series = |layer: &&LayerArg| matches!(layer.data, Data::Steps(_));
+        let series = |layer: &LayerArg| Series {
+            name: layer.name.clone(),
+            layers: steps_of(layer).into_iter().map(|step| step.name).collect(),
+            step_seconds,
+        };
+        let series: Vec<Series> = surfaces.iter().filter(is_series).map(series).collect();
+        let surfaces: Vec<LayerArg> = surfaces.iter().flat_map(steps_of).collect();
         let mut sources: Vec<Option<Source>> = Vec::with_capacity(surfaces.len());
         for layer in &surfaces {
             let Data::Files(files) = &layer.data else {
@@ -196,15 +281,36 @@ impl Layers {
         }
         let opened = surfaces.into_iter().zip(sources).filter_map(|(layer, source)| {
             let What::Surface(kind) = layer.what else { return None };
-            Some((layer, kind, source?))
+            let files = if let Data::Files(files) = layer.data { files } else { Vec::new() };
+            Some(Opened { name: layer.name, kind, files, source: source? })
         });
-        Ok(Self { opened: opened.collect(), textures })
+        let layers = Self { opened: opened.collect(), textures, series };
+        layers.series.iter().try_for_each(|series| layers.check(series))?;
+        Ok(layers)
+    }
+
+    /// Refuses steps that are not of one surface.
+    fn check(&self, series: &Series) -> Result<(), OpenError> {
+        let mut steps = self.opened.iter().filter(|layer| series.layers.contains(&layer.name));
+        let Some(first) = steps.next() else { return Ok(()) };
+        for step in steps {
+            if let Some(what) = series_args::differ([first, step].map(|of| (of.files.as_slice(), &of.source)))
+            {
+                return Err(OpenError::Steps { series: series.name.clone(), what });
+            }
+        }
+        Ok(())
+    }
+
+    /// Which layers are the steps of which series.
+    pub(super) fn series(&self) -> &[Series] {
+        &self.series
     }
 
     /// What is to be built.
     pub(super) fn sources(&self) -> Vec<LayerSource<'_>> {
         let each = self.opened.iter();
-        each.map(|(layer, kind, source)| LayerSource { name: &layer.name, kind: *kind, source }).collect()
+        each.map(|Opened { name, kind, source, .. }| LayerSource { name, kind: *kind, source }).collect()
     }
 
     /// What is to be draped on it.
@@ -215,20 +321,20 @@ impl Layers {
 
     /// The files of a layer; of the only one, if none is named.
     pub(super) fn files(&self, layer: Option<&str>) -> &[PathBuf] {
-        let found = self.opened.iter().find(|(of, ..)| layer.is_none_or(|name| of.name == name));
-        match found.map(|(of, ..)| &of.data) {
-            Some(Data::Files(files)) => files,
-            _ => &[],
-        }
+        let found = self.opened.iter().find(|of| layer.is_none_or(|name| of.name == name));
+        found.map_or(&[], |of| &of.files)
     }
 
     /// Layers and textures that do not touch the first layer: they are shown far from it, which is seldom meant.
     pub(super) fn apart(&self) -> Vec<&str> {
-        let Some((_, _, first)) = self.opened.first() else { return Vec::new() };
-        let surfaces = self.opened.iter().map(|(layer, _, source)| (layer, source.grid()));
-        let textures = self.textures.iter().map(|(texture, imagery)| (texture, imagery.grid()));
-        let far = surfaces.chain(textures).filter(|(_, grid)| !touch(first.grid(), grid));
-        far.map(|(layer, _)| layer.name.as_str()).collect()
+        let Some(first) = self.opened.first() else { return Vec::new() };
+        // All steps of a series lie where its first does.
+        let is_later = |name: &String| self.series.iter().any(|series| series.layers[1..].contains(name));
+        let surfaces = self.opened.iter().filter(|layer| !is_later(&layer.name));
+        let surfaces = surfaces.map(|layer| (&layer.name, layer.source.grid()));
+        let textures = self.textures.iter().map(|(texture, imagery)| (&texture.name, imagery.grid()));
+        let far = surfaces.chain(textures).filter(|(_, grid)| !touch(first.source.grid(), grid));
+        far.map(|(name, _)| name.as_str()).collect()
     }
 }
 
@@ -296,6 +402,29 @@ mod tests {
             assert_eq!(layer.data, Data::Files(expected.map(PathBuf::from).to_vec()));
         }
         assert_eq!(joined(&[], &["ground=terrain:a.tif"]).unwrap().len(), 1);
+        let folder = tempfile::tempdir().unwrap();
+        let [w1, w2] = ["w_1.tif", "w_2.tif"].map(|name| folder.path().join(name));
+        for file in [&w1, &w2] {
+            std::fs::write(file, "").unwrap();
+        }
+        let pattern = folder.path().join("w_*.tif").display().to_string();
+        let waves = format!("sea=water:{pattern}");
+        let layers = joined(&some, &[&waves]).unwrap();
+        assert_eq!((layers.len(), &layers[1].data), (2, &Data::Steps(vec![w1, w2])));
+        let names: Vec<String> = steps_of(&layers[1]).into_iter().map(|step| step.name).collect();
+        assert_eq!(names, ["sea.0", "sea.1"]);
+        for (named, word) in [
+            (&[&waves, "sea=water:s.tif"][..], "a series and something else besides"),
+            (&[&waves, &waves], "a series and something else besides"),
+            (&["sea=water:s.tif", &waves], "a series and something else besides"),
+            (&["sea=water:none_*.tif"], "--layer sea: none_*.tif: expected files that match, found none"),
+            (&[&format!("rock=terrain:{pattern}")], "patterns are for water"),
+            (&[&format!("photo=texture:{pattern}")], "patterns are for water"),
+            (&[&format!("{}=water:{pattern}", "a".repeat(63))], "a shorter name"),
+        ] {
+            let error = joined(&some, named).unwrap_err();
+            assert!(error.contains(word), "{named:?}: {error}");
+        }
         for (files, named, word) in [
             (&some[..], &["terrain=water:b.tif"][..], "as files without --layer are"),
             (&some, &["sea=water:a.tif", "sea=terrain:b.tif"], "'sea' is water and terrain"),

@@ -3,6 +3,7 @@
 mod arguments;
 mod layer_args;
 mod print;
+mod series_args;
 
 use arguments::{
     BuildArgs, Cli, Command, ConfigCommand, DemoArgs, Encoding, ExperimentArgs, InspectArgs, MetricName,
@@ -11,8 +12,9 @@ use arguments::{
 use clap::{ArgMatches, CommandFactory, FromArgMatches};
 use diamantina_protocol::message::is_name;
 use diamantina_protocol::points::Rule;
+use diamantina_protocol::series::STEP_SECONDS;
 use diamantina_server::experiment::ExperimentError;
-use diamantina_server::hierarchy::{self, BuildError, TinOptions};
+use diamantina_server::hierarchy::{self, BuildError, Content, TinOptions};
 use diamantina_server::ingest::IngestError;
 use diamantina_server::inspect;
 use diamantina_server::progress::Progress;
@@ -21,7 +23,7 @@ use diamantina_server::store::{Disk, Published, Publisher, Shared, Store, StoreE
 use diamantina_server::tin::Metric;
 use diamantina_server::zone::{self, ZoneError};
 use diamantina_server::{curve, demo, experiment, http, texture};
-use layer_args::Layers;
+use layer_args::{Layers, OpenError};
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -166,10 +168,20 @@ fn build(args: &BuildArgs) -> Result<(), Failure> {
         fresh: args.fresh,
         checkpoint: Duration::from_secs(args.checkpoint),
     };
+    if !STEP_SECONDS.contains(&args.step_seconds) {
+        let (least, most) = (STEP_SECONDS.start(), STEP_SECONDS.end());
+        return Err(Failure(
+            2,
+            format!("--step-seconds {}: expected seconds from {least} to {most}", args.step_seconds),
+        ));
+    }
     let layers = layer_args::join(&args.sources, &args.layers).map_err(|e| Failure(2, e))?;
     // Flat water has as many cells as the least forest.
-    let layers = Layers::open(layers, &args.ingest, options.patch_log2 + 1)
-        .map_err(|e| refuse_build(None, &e.into()))?;
+    let opened = Layers::open(layers, &args.ingest, options.patch_log2 + 1, args.step_seconds);
+    let layers = opened.map_err(|e| match e {
+        OpenError::Ingest(e) => refuse_build(None, &e.into()),
+        OpenError::Steps { .. } => Failure(2, e.to_string()),
+    })?;
     for name in layers.apart() {
         let words =
             "does not touch the first layer: are both files in the systems of coordinates that they name?";
@@ -182,7 +194,7 @@ fn build(args: &BuildArgs) -> Result<(), Failure> {
         if args.json {
             writeln!(out, "{}", serde_json::to_string_pretty(&estimates)?)?;
         } else {
-            print::estimates(&mut out, &args.output, &estimates)?;
+            print::estimates(&mut out, &args.output, &estimates, layers.series())?;
             for source in layers.textures() {
                 let texture = texture::describe(source, options.texture_quality)
                     .map_err(|error| Failure(2, format!("texture '{}': {error}", source.name)))?;
@@ -199,7 +211,9 @@ fn build(args: &BuildArgs) -> Result<(), Failure> {
         .unwrap_or_default();
     let progress = Arc::new(Progress::new());
     stop_on_signals(&progress)?;
-    let report = hierarchy::build_scene(&layers.sources(), &layers.textures(), built, &options, &progress)
+    let content =
+        Content { layers: &layers.sources(), textures: &layers.textures(), series: layers.series() };
+    let report = hierarchy::build_scene(content, built, &options, &progress)
         .map_err(|e| refuse_build(Some(&layers), &e))?;
     if let Some(upload) = &upload {
         send(&upload.publisher, built, &args.output, false, &progress)?;

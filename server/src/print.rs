@@ -1,7 +1,8 @@
 //! What commands print of their results, for people.
 
 use crate::layer_args::word;
-use diamantina_protocol::message::Layer;
+use diamantina_protocol::message::{Layer, Scene};
+use diamantina_protocol::series::Series;
 use diamantina_protocol::texture::Texture;
 use diamantina_server::experiment;
 use diamantina_server::hierarchy::{Estimate, Estimates, LayerReport, Report};
@@ -10,7 +11,37 @@ use diamantina_server::zone;
 use std::io::Write;
 use std::path::Path;
 
-pub(super) fn estimates(out: &mut impl Write, store: &Path, e: &Estimates) -> std::io::Result<()> {
+/// Whether a layer is a step of a series, but not its first: what is told of that holds, more or less, for all.
+fn is_later_step(all: &[Series], layer: &str) -> bool {
+    all.iter().any(|series| series.layers.iter().skip(1).any(|step| step == layer))
+}
+
+/// A series in a line, with what its steps take in all.
+fn series(out: &mut impl Write, series: &Series, bytes: u64) -> std::io::Result<()> {
+    writeln!(
+        out,
+        "series {}: {} step{} of {} s, {bytes} bytes in all; --json tells of each",
+        series.name,
+        series.layers.len(),
+        if series.layers.len() == 1 { "" } else { "s" },
+        series.step_seconds
+    )
+}
+
+fn all_series(out: &mut impl Write, scene: &Scene) -> std::io::Result<()> {
+    for one in &scene.series {
+        let steps = scene.layers.iter().filter(|layer| one.layers.contains(&layer.name));
+        series(out, one, steps.map(|layer| layer.bytes).sum())?;
+    }
+    Ok(())
+}
+
+pub(super) fn estimates(
+    out: &mut impl Write,
+    store: &Path,
+    e: &Estimates,
+    all: &[Series],
+) -> std::io::Result<()> {
     writeln!(
         out,
         "{}: estimated from {} of {} samples; nothing was written",
@@ -18,9 +49,13 @@ pub(super) fn estimates(out: &mut impl Write, store: &Path, e: &Estimates) -> st
         e.all.sampled,
         e.all.samples
     )?;
-    for layer in e.layers.iter().filter(|_| e.layers.len() > 1) {
+    for layer in e.layers.iter().filter(|layer| e.layers.len() > 1 && !is_later_step(all, &layer.name)) {
         writeln!(out, "layer {}: {} samples", layer.name, layer.estimate.samples)?;
         estimate(out, &layer.estimate)?;
+    }
+    for one in all {
+        let steps = e.layers.iter().filter(|layer| one.layers.contains(&layer.name));
+        series(out, one, steps.map(|step| step.estimate.point_bytes + step.estimate.tin_bytes).sum())?;
     }
     if e.layers.len() > 1 {
         writeln!(out, "all layers, one after the other:")?;
@@ -54,11 +89,15 @@ fn estimate(out: &mut impl Write, e: &Estimate) -> std::io::Result<()> {
 pub(super) fn report(out: &mut impl Write, store: &Path, report: &Report) -> std::io::Result<()> {
     writeln!(out, "{}: scene '{}', version {}", store.display(), report.scene.name, report.scene.version)?;
     for (layer, found) in report.scene.layers.iter().zip(&report.layers) {
+        if is_later_step(&report.scene.series, &layer.name) {
+            continue;
+        }
         if report.layers.len() > 1 {
             writeln!(out, "layer {}: {}", layer.name, word(layer.kind))?;
         }
         built(out, layer, found)?;
     }
+    all_series(out, &report.scene)?;
     for texture in &report.scene.textures {
         self::texture(out, texture)?;
     }
@@ -134,6 +173,9 @@ pub(super) fn inspection(out: &mut impl Write, i: &Inspection) -> std::io::Resul
     let crs = i.scene.frame.crs.as_ref().map_or("unknown", |c| &c.name);
     writeln!(out, "scene {}  version {}  CRS {crs}", i.scene.name, i.scene.version)?;
     for (layer, about) in i.layers.iter().zip(&i.scene.layers) {
+        if is_later_step(&i.scene.series, &layer.name) {
+            continue;
+        }
         let [columns, rows] = about.forest.roots();
         writeln!(
             out,
@@ -171,6 +213,7 @@ pub(super) fn inspection(out: &mut impl Write, i: &Inspection) -> std::io::Resul
             writeln!(out, "  {real} real points, {fictitious} fictitious")?;
         }
     }
+    all_series(out, &i.scene)?;
     for texture in &i.scene.textures {
         self::texture(out, texture)?;
     }

@@ -276,6 +276,7 @@ mod tests {
             layers: vec![],
             zones: vec![],
             textures: vec![],
+            series: vec![],
         };
         let args = parsed(words);
         assert!(args.check().is_ok(), "{words}");

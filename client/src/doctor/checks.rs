@@ -105,7 +105,7 @@ impl<'a> Subject<'a> {
         };
         match scene.and_then(|scene| check_scene(&scene).map(|()| scene)) {
             Ok(scene) => {
-                let layers: Vec<&str> = scene.layers.iter().map(|layer| layer.name.as_str()).collect();
+                let layers = scene.choices();
                 let (name, version) = (&scene.name, &scene.version);
                 tell(good("scene", format!("{name} at version {version}, layers {}", layers.join(", "))));
                 Self::of(server, scene, tell).await

@@ -7,9 +7,10 @@ use bytes::Bytes;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::{self, Entry};
-use diamantina_protocol::message::{self, Catalogue, FrameHeader, Layer, Scene, Status};
+use diamantina_protocol::message::{self, Catalogue, FrameHeader, Kind, Layer, Scene, Status};
+use diamantina_protocol::series::Series;
 use diamantina_protocol::texture::TEXTURES_MAX;
-use diamantina_protocol::zone::{self, Mask};
+use diamantina_protocol::zone::{self, LAYERS_MAX, Mask};
 use futures_util::StreamExt as _;
 use reqwest::{Client, Response, StatusCode, Url};
 use std::hash::BuildHasher;
@@ -37,9 +38,6 @@ pub(super) const PAGE_BYTES_MAX: usize = 4 * index::PAGE_BYTES_MAX;
 
 /// The largest masks of a zone, compressed, in bytes: what a store may hold.
 const ZONE_BYTES_MAX: usize = 16 << 20;
-
-/// The most layers of a scene.
-pub const LAYERS_MAX: usize = 64;
 
 /// The base of an address, and the scene that it names.
 pub(crate) fn parse_address(text: &str) -> Result<(Url, Option<String>), FetchError> {
@@ -102,6 +100,11 @@ pub(crate) fn check(scene: &Scene) -> Result<(), String> {
             return Err(format!("layer '{name}': numbers beyond all measure"));
         }
     }
+    if let Some(series) = scene.series.iter().find(|series| !message::is_name(&series.name)) {
+        return Err(format!("series '{}': expected another name", series.name.escape_debug()));
+    }
+    let layers = scene.layers.iter().map(|layer| (layer.name.as_str(), layer.kind == Kind::Water));
+    Series::positions(&scene.series, layers).map_err(|e| e.to_string())?;
     if scene.textures.len() > TEXTURES_MAX {
         return Err(format!("{} textures, expected at most {TEXTURES_MAX}", scene.textures.len()));
     }
@@ -400,6 +403,18 @@ mod tests {
         assert!(with(&|s| s.layers[0].cell[1] = f64::NAN).is_err());
         assert!(with(&|s| s.layers[0].origin[1] = 1e300).is_err());
         assert!(with(&|s| s.layers[0].coding = s.layers[1].coding.clone()).is_err());
+        assert_eq!(check(&scene(4)), Ok(()), "with a series");
+        for change in [
+            (|s| s.series[0].name = "a/b".into()) as fn(&mut Scene),
+            |s| s.series[0].name = "water".into(),
+            |s| s.series[0].layers[0] = "terrain".into(),
+            |s| s.series[0].step_seconds = -1.0,
+            |s| s.series[0].layers.clear(),
+        ] {
+            let mut scene = scene(4);
+            change(&mut scene);
+            assert!(check(&scene).unwrap_err().contains("series"));
+        }
     }
 
     #[test]

@@ -39,7 +39,6 @@ mod tests;
 
 pub use batch::ROOT_BYTES;
 pub use error::FetchError;
-pub use http::LAYERS_MAX;
 pub(crate) use http::parse_address;
 #[cfg(not(target_arch = "wasm32"))]
 pub(crate) use http::{check as check_scene, decode_page, transport};
@@ -178,17 +177,18 @@ impl Traffic {
     }
 }
 
-/// Makes sure that a scene has all layers that are asked for by name.
+/// Makes sure that a scene has all layers that are asked for by name; the steps of a series by its own.
 ///
 /// # Errors
 /// When it has not.
 pub(crate) fn check_layers(scene: &Scene, asked: &[String]) -> Result<(), FetchError> {
-    match asked.iter().find(|name| !scene.layers.iter().any(|layer| layer.name == **name)) {
+    let choices = scene.choices();
+    match asked.iter().find(|name| !choices.contains(&name.as_str())) {
         None => Ok(()),
         Some(unknown) => Err(FetchError::Layer {
             scene: scene.name.clone(),
             asked: unknown.clone(),
-            layers: scene.layers.iter().map(|layer| layer.name.clone()).collect(),
+            layers: choices.into_iter().map(str::to_owned).collect(),
         }),
     }
 }
@@ -306,9 +306,17 @@ impl Fetcher {
 
     /// Replaces the wishes, most urgent first, of which at most [`WISHES_MAX`] count. Requests of which
     /// nothing is wished for any more are dropped.
-    pub fn wish(&mut self, mut wishes: Vec<Want>) {
+    pub fn wish(&mut self, wishes: Vec<Want>) {
+        let pressing = wishes.len();
+        self.wish_ahead(wishes, pressing);
+    }
+
+    /// As [`Fetcher::wish`]; what comes after the first `pressing` wishes is for later: a quarter of the requests at most
+    /// are for diamonds of it, so that what presses soon has its turn.
+    pub fn wish_ahead(&mut self, mut wishes: Vec<Want>, pressing: usize) {
         wishes.truncate(WISHES_MAX);
         let mut state = self.shared.lock();
+        state.pressing = pressing;
         let seen = self.seen;
         state.delivered.retain(|_, serial| *serial > seen);
         if wishes.is_empty() && state.wishes.is_empty() {

@@ -44,6 +44,8 @@ pub(super) struct Shared {
 #[derive(Debug, Default)]
 pub(super) struct State {
     pub(super) wishes: Vec<Want>,
+    /// How many of the wishes, the first, are not for later.
+    pub(super) pressing: usize,
     /// Streams that have not begun: at most one a layer.
     pub(super) streams: VecDeque<(usize, StreamAsk)>,
     pub(super) flights: HashMap<u64, Flight>,
@@ -67,6 +69,8 @@ pub(super) struct Flight {
     pub(super) cancel: Arc<Notify>,
     is_page: bool,
     is_tile: bool,
+    /// Whether it is a batch for later.
+    is_ahead: bool,
     /// The layer, if it is a stream.
     pub(super) stream: Option<usize>,
     /// Whether something of it has arrived.
@@ -171,7 +175,10 @@ impl Shared {
         let may_batch = state.flights.values().filter(is_batch).count() < half;
         // Pictures share the line with heights.
         let may_tile = state.flights.values().filter(|f| f.is_tile).count() < half;
-        for want in wishes {
+        let quarter = self.requests_max.div_ceil(4);
+        let may_look_ahead = state.flights.values().filter(|f| f.is_ahead).count() < quarter;
+        let mut is_ahead = false;
+        for (number, want) in wishes.iter().enumerate() {
             let rests = match want.key {
                 Key::Page(layer, _) | Key::Diamond(layer, _) => resting[layer],
                 Key::Coverage(_) | Key::Tile(..) => !may_tile || imagery.is_some(),
@@ -190,8 +197,10 @@ impl Shared {
                 Key::Coverage(texture) => imagery = Some(Request::Coverage(texture)),
                 Key::Tile(texture, tile) => imagery = Some(Request::Tile(texture, tile)),
                 Key::Diamond(..) if !may_batch => {}
+                Key::Diamond(..) if number >= state.pressing && !may_look_ahead => {}
                 Key::Diamond(layer, d) => {
                     let batch = batch.get_or_insert_with(|| {
+                        is_ahead = number >= state.pressing;
                         Batch::new(&self.http.base, &self.scene, self.encoding, layer)
                     });
                     if batch.layer == layer && !batch.push(d, want.bytes) {
@@ -235,10 +244,18 @@ impl Shared {
         }
         let cancel = Arc::new(Notify::new());
         let is_page = matches!(request, Request::Page(..));
+        let is_ahead = is_ahead && matches!(request, Request::Batch(..));
         let is_tile = matches!(request, Request::Coverage(_) | Request::Tile(..));
         let stream = if let Request::Stream(layer, _) = &request { Some(*layer) } else { None };
-        let flight =
-            Flight { cancel: Arc::clone(&cancel), is_page, is_tile, stream, useful: false, is_out: false };
+        let flight = Flight {
+            cancel: Arc::clone(&cancel),
+            is_page,
+            is_tile,
+            is_ahead,
+            stream,
+            useful: false,
+            is_out: false,
+        };
         state.flights.insert(id, flight);
         Next::Fetch { id, cancel, request }
     }

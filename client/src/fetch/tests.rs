@@ -91,6 +91,32 @@ fn of_eight_requests_half_may_be_for_diamonds_and_one_is() {
 }
 
 #[test]
+fn what_is_for_later_has_a_quarter_of_the_requests_and_never_the_turn_of_what_presses() {
+    let each: Vec<Want> =
+        wants(9).into_iter().map(|want| Want { bytes: Some(BATCH_BYTES as u32), ..want }).collect();
+    assert!(each.len() >= 8);
+    let served = Served::start(1, Faults::default());
+    let (mut fetcher, _) = Fetcher::open(&served.url, &Options::default()).unwrap();
+    served.misbehave(Faults { silent: 1.0, ..Faults::default() });
+    let flying = |fetcher: &mut Fetcher, least: usize| {
+        let until = Instant::now() + Duration::from_secs(20);
+        while fetcher.shared.lock().flying.len() < least && Instant::now() < until {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        // A task more would have taken something by now.
+        std::thread::sleep(Duration::from_millis(50));
+        fetcher.shared.lock().flying.keys().copied().collect::<HashSet<Key>>()
+    };
+    // All is for later.
+    fetcher.wish_ahead(each[4..].to_vec(), 0);
+    assert_eq!(flying(&mut fetcher, 2), HashSet::from([each[4].key, each[5].key]));
+    // Something presses: it has the requests that were kept for it.
+    fetcher.wish_ahead(each.clone(), 4);
+    let keys = flying(&mut fetcher, 4);
+    assert_eq!(keys, HashSet::from([each[0].key, each[1].key, each[4].key, each[5].key]));
+}
+
+#[test]
 fn batches_stay_within_their_limits() {
     let served = Served::start(1, Faults::default());
     let (mut fetcher, _) = Fetcher::open(&served.url, &Options::default()).unwrap();

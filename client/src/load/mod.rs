@@ -89,7 +89,17 @@ pub fn run(url: &str, options: &Options, mut tell: impl FnMut(&Report)) -> Resul
     let mut scene = runtime.block_on(describe(client(0)?, &root, name.as_deref()))?;
     if let Some(names) = &options.layers {
         check_layers(&scene, names)?;
-        scene.layers.retain(|layer| names.contains(&layer.name));
+        let chosen: Vec<bool> = scene
+            .layers
+            .iter()
+            .map(|layer| names.iter().any(|n| n == scene.chosen_as(&layer.name)))
+            .collect();
+        let mut chosen = chosen.into_iter();
+        scene.layers.retain(|_| chosen.next().unwrap_or(false));
+    }
+    // Users look at the first step of a series.
+    for series in std::mem::take(&mut scene.series) {
+        scene.layers.retain(|layer| !series.layers[1..].contains(&layer.name));
     }
     for layer in &mut scene.layers {
         let (name, asked) = (layer.name.clone(), options.encoding.name());

@@ -480,6 +480,7 @@ fn other_bodies_are_grey() {
             layers: vec![],
             zones: vec![],
             textures: vec![],
+            series: vec![],
         })
     };
     for earth in [None, Some("+proj=utm +zone=11 +datum=WGS84"), Some("+proj=merc +a=6378137 +b=6378137")] {

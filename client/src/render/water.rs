@@ -250,6 +250,15 @@ impl WaterPasses {
         for draw in water {
             of_layer.entry(draw.item.layer).or_default().push(draw);
         }
+        // The step of a series that is drawn now takes over from that which was.
+        for number in
+            of_layer.keys().filter(|number| !self.mirrors.contains_key(number)).copied().collect::<Vec<_>>()
+        {
+            let idle = self.mirrors.keys().find(|other| !of_layer.contains_key(other)).copied();
+            if let Some(mirror) = idle.and_then(|other| self.mirrors.remove(&other)) {
+                self.mirrors.insert(number, mirror);
+            }
+        }
         for (number, draws) in of_layer {
             let layer = &layers[number];
             if self.mirrors.get(&number).is_none_or(|mirror| mirror.sheet.size != size) {

@@ -3,6 +3,7 @@
 //! It may be coarser than what is seen straight, since waves and a faint mirror hide that, and draws what lies
 //! out of the picture but shows in the water. What it lacks is asked for after what the picture itself lacks as much.
 
+use super::steps::Role;
 use super::{FrameView, Terrain};
 use crate::camera::Camera;
 use crate::cut::{self, Ask, Gpu, Ideal, Wish};
@@ -32,8 +33,11 @@ impl Terrain {
     }
 
     fn is_mirror(&self, number: usize) -> bool {
+        let state = &self.layers[number];
         let is_water = self.scene.layers[number].kind == Kind::Water;
-        self.mirrors.is_some() && is_water && self.layers[number].shown
+        // Of water that changes with time, the step that is drawn.
+        let is_drawn = state.shown && matches!(state.role, Role::Drawn | Role::Stays);
+        self.mirrors.is_some() && is_water && is_drawn
     }
 
     /// Says what the water that a frame draws mirrors, and what is missing for that.

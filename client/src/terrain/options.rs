@@ -25,6 +25,8 @@ pub struct Options {
     pub morph_seconds: f64,
     /// The names of the layers to stream and draw; none: all.
     pub layers: Option<Vec<String>>,
+    /// The time that series of water surfaces show at first, in seconds.
+    pub time: f64,
     /// The name of a zone: while the eye is in it, less is asked for where nothing is seen from there.
     pub zone: Option<String>,
     /// What lies on the terrain.
@@ -49,6 +51,7 @@ impl Default for Options {
             gpu_bytes: 512 << 20,
             morph_seconds: 0.0,
             layers: None,
+            time: 0.0,
             zone: None,
             imagery: Imagery::First,
             texture_bytes: 128 << 20,

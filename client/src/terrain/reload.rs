@@ -111,6 +111,7 @@ impl Terrain {
             next.options.exaggeration = self.options.exaggeration;
             next.wires = self.wires;
             next.show_only(self.options.layers.clone());
+            next.set_time(self.time(), self.steps.course);
             let view = next.draw_at(camera, seconds);
             let is_as_exact = view.error_pixels <= self.error_pixels || view.complete || next.is_stuck();
             // Nor is imagery missing for a while.

@@ -10,6 +10,7 @@
 //! | motions | 1/16 | [`MOTIONS_MAX`] a layer |
 
 use super::LayerState;
+use super::steps::Steps;
 use crate::cache::PAGES_MAX;
 use crate::morph::{MOTIONS_MAX, Record};
 use crate::surface::Points;
@@ -67,9 +68,10 @@ impl Shares {
         }
     }
 
-    /// Gives each of the layers that are shown its own.
-    pub(super) fn share_out(&self, layers: &mut [LayerState], gpu_bytes: u64) {
-        let shown = layers.iter().filter(|state| state.shown).count().max(1);
+    /// Gives each of the layers that are shown its own; the steps of a series have one together.
+    pub(super) fn share_out(&self, layers: &mut [LayerState], steps: &Steps, gpu_bytes: u64) {
+        let is_counted = |(number, state): &(usize, &LayerState)| state.shown && steps.is_wanted(*number);
+        let shown = layers.iter().enumerate().filter(|layer| is_counted(layer)).count().max(1);
         for state in layers {
             state.memory_bytes = self.cut / shown;
             state.gpu_bytes = gpu_bytes / shown as u64;

@@ -1,8 +1,9 @@
 //! Which layers are streamed and drawn.
 //!
 //! One that is hidden keeps its index, and what is resident of it until the room is needed; no more of it is asked for.
+//! The steps of a series are shown together, by its name.
 
-use super::{Layer, LayerState, Scene, Terrain};
+use super::{Layer, Scene, Terrain};
 use crate::cut::Ideal;
 use crate::morph::Morphs;
 
@@ -13,23 +14,33 @@ impl Terrain {
         self.layers.get(layer).is_some_and(|state| state.shown)
     }
 
-    /// Shows a layer from the next frame on, or hides it. What the layers' surfaces may take of the memory is shared by
-    /// those that are shown.
+    /// Shows a layer from the next frame on, or hides it, and with a step its whole series. What the layers' surfaces may
+    /// take of the memory is shared by those that are shown.
     pub fn set_shown(&mut self, layer: usize, shown: bool) {
-        let wanted = |number: usize, state: &LayerState| if number == layer { shown } else { state.shown };
-        let layers = self.scene.layers.iter().zip(&self.layers).enumerate();
-        let names = layers.filter(|(number, (_, state))| wanted(*number, state));
-        let names: Vec<String> = names.map(|(_, (layer, _))| layer.name.clone()).collect();
+        let Some(of) = self.scene.layers.get(layer).map(|layer| self.scene.chosen_as(&layer.name)) else {
+            return;
+        };
+        let is_shown = |name: &str| {
+            let mut layers = self.scene.layers.iter().zip(&self.layers);
+            layers.any(|(layer, state)| state.shown && self.scene.chosen_as(&layer.name) == name)
+        };
+        let choices = self.scene.choices();
+        let wanted = choices.iter().filter(|name| if **name == of { shown } else { is_shown(name) });
+        let names: Vec<String> = wanted.map(|name| (*name).to_owned()).collect();
         // All are all of another version, too.
-        let is_all = names.len() == self.layers.len();
+        let is_all = names.len() == choices.len();
         self.show_only((!is_all).then_some(names));
     }
 
     /// Shows the layers of these names, or all. Where there is none of them, as in a version with other layers, all.
     pub(super) fn show_only(&mut self, names: Option<Vec<String>>) {
-        let is_there = |name: &String| self.scene.layers.iter().any(|layer| layer.name == *name);
+        let choices = self.scene.choices();
+        let is_there = |name: &String| choices.contains(&name.as_str());
         let names = names.filter(|names| names.is_empty() || names.iter().any(is_there));
-        let wanted = |layer: &Layer| names.as_ref().is_none_or(|names| names.contains(&layer.name));
+        let wanted = |layer: &Layer| {
+            let of = self.scene.chosen_as(&layer.name);
+            names.as_ref().is_none_or(|names| names.iter().any(|name| name == of))
+        };
         for (layer, state) in self.scene.layers.iter().zip(&mut self.layers) {
             if wanted(layer) != state.shown {
                 state.shown = wanted(layer);
@@ -38,8 +49,13 @@ impl Terrain {
                 state.morphs = Morphs::new(self.options.morph_seconds);
             }
         }
-        self.shares.share_out(&mut self.layers, self.options.gpu_bytes);
+        self.share_out();
         self.options.layers = names;
+    }
+
+    /// Gives each layer its share of the memory.
+    pub(super) fn share_out(&mut self) {
+        self.shares.share_out(&mut self.layers, &self.steps, self.options.gpu_bytes);
     }
 
     /// The scene with no layers but those that are shown; with all, where none is. For its extent: positions of layers are

@@ -1,6 +1,7 @@
 //! A scene streamed from a made server, frame by frame.
 
 mod kept;
+mod steps;
 
 use super::*;
 use crate::world::{Dice, Faults, Ground, Served, above, any_camera, world};

@@ -45,15 +45,15 @@ pub(super) fn show(viewer: &mut Viewer, ui: &mut Ui) {
     for (i, one) in viewer.bookmarks.list.iter().enumerate() {
         ui.horizontal(|ui| {
             if ui.link(&one.name).on_hover_text(&one.view).clicked() {
-                wanted = camera_at(&one.view, viewer.camera().size);
+                wanted = Some(one.view.clone());
             }
             if ui.small_button(RichText::new("×").weak()).on_hover_text("forget it").clicked() {
                 gone = Some(i);
             }
         });
     }
-    if let Some(camera) = wanted {
-        viewer.fly_to(&camera);
+    if let Some(view) = wanted {
+        viewer.go_to(&view);
     }
     if let Some(i) = gone {
         viewer.bookmarks.list.remove(i);

@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `panel` | sliders, choices, figures, and what was clicked |
 //! | `truth` | the switch that shows nothing but what was measured |
+//! | `time` | the clock of water that changes with time |
 //! | `display` | a window or a canvas, and what draws on it |
 //! | [`window`] | a native window: events in, pictures out |
 //!
@@ -21,12 +22,14 @@ mod measure;
 mod panel;
 #[cfg(not(target_arch = "wasm32"))]
 mod shelf;
+mod time;
 mod truth;
 #[cfg(not(target_arch = "wasm32"))]
 pub mod window;
 
 pub use bookmarks::{Bookmark, read as read_bookmarks};
 pub use measure::Mark;
+pub use time::time_at;
 
 use crate::annotate::{self, Subject};
 use crate::camera::Camera;
@@ -35,6 +38,7 @@ use crate::drawing::{DrawItem, Mirror};
 use crate::globe::Globe;
 use crate::overview;
 use crate::pick::{Hit, Picker, Ray};
+use crate::player::Player;
 use crate::render::{FrameStats, Look};
 use crate::terrain::{FrameView, Terrain};
 use crate::texture::{Coding, Drape};
@@ -105,6 +109,7 @@ pub struct Viewer {
     panel_is_open: bool,
     shows_boxes: bool,
     history: History,
+    player: Player,
     drawn: FrameStats,
     message: Option<String>,
     asks: Vec<Ask>,
@@ -118,6 +123,7 @@ impl Viewer {
         let home = overview::stretched_overview(&terrain.shown_scene(), size, look.exaggeration);
         let stretched = |c: Camera| Camera { size, ..overview::stretched(&c, look.exaggeration) };
         let globe = Globe::of(&terrain.scene().frame);
+        let time = terrain.time();
         Self {
             controls: Controls::new(stretched(camera.unwrap_or(home))),
             home: stretched(home),
@@ -136,6 +142,7 @@ impl Viewer {
             panel_is_open: true,
             shows_boxes: false,
             history: History::default(),
+            player: Player::at(time),
             drawn: FrameStats::default(),
             message: None,
             asks: Vec::new(),
@@ -225,7 +232,8 @@ impl Viewer {
         self.home.size = self.camera().size;
     }
 
-    /// The scene's address with the view: `URL#x,y,z,heading,pitch`, metres and degrees.
+    /// The scene's address with the view: `URL#x,y,z,heading,pitch`, metres and degrees; with a comma and seconds behind
+    /// where water changes with time.
     #[must_use]
     pub fn address(&self) -> String {
         format!("{}#{}", self.url, self.view())
@@ -238,7 +246,12 @@ impl Viewer {
         let z = eye.z / self.look.exaggeration;
         let [heading, pitch] = [self.controls.heading(), self.controls.pitch()].map(f64::to_degrees);
         let heading = heading.rem_euclid(360.0);
-        format!("{:.2},{:.2},{z:.2},{heading:.3},{pitch:.3}", eye.x, eye.y)
+        let time = if self.terrain.scene().series.is_empty() {
+            String::new()
+        } else {
+            format!(",{:.3}", self.player.seconds)
+        };
+        format!("{:.2},{:.2},{z:.2},{heading:.3},{pitch:.3}{time}", eye.x, eye.y)
     }
 
     /// Flies to where another camera is, whose heights are as they are.
@@ -280,6 +293,7 @@ impl Viewer {
         let (reloads, is_replaced) = (self.frame.stats.reloads, self.terrain.scene_changed());
         self.terrain.set_wires(self.look.wireframe);
         self.terrain.set_mirrors(self.look.mirrors().then_some(self.look.water.mirror_error));
+        self.pass(seconds);
         self.frame = self.terrain.frame(self.controls.camera());
         if self.frame.stats.reloads != reloads {
             // Of whatever encoding, its surfaces are the frame's before.
@@ -301,7 +315,8 @@ impl Viewer {
         if has_waves {
             self.look.water.seconds += seconds;
         }
-        if !self.frame.complete || self.frame.moving > 0 || self.controls.is_gliding() || has_waves {
+        let is_moving = self.frame.moving > 0 || self.controls.is_gliding() || has_waves || self.player.plays;
+        if !self.frame.complete || is_moving {
             ui.ctx().request_repaint();
         }
     }
@@ -315,7 +330,7 @@ impl Viewer {
         let items = self.items();
         let layers = &self.terrain.scene().layers;
         let centre = annotate::centre(&mut self.picker, layers, &items, &self.look, camera);
-        let layers = self.terrain.shown_scene().layers;
+        let layers = self.terrain.drawn_layers();
         let globe = self.globe.as_ref();
         let subject = Subject { camera, look: &self.look, layers: &layers, globe, centre };
         annotate::show(painter, area, &subject);
@@ -485,6 +500,10 @@ impl Viewer {
         if pressed(Key::P) {
             self.ask_screenshot();
         }
+        // A button that has the focus takes the key for itself.
+        if pressed(Key::Space) && ui.memory(|memory| memory.focused().is_none()) {
+            self.play();
+        }
         if pressed(Key::Escape) {
             self.marks.clear();
             self.message = None;
@@ -549,12 +568,14 @@ fn is_pressed(ui: &Ui, key: Key) -> bool {
     ui.input(|input| input.events.iter().any(is_it))
 }
 
-/// The camera of what follows the `#` of an address: see [`Viewer::address`]. `None` if it is none.
+/// The camera of what follows the `#` of an address: see [`Viewer::address`]. `None` if it is none. See also [`time_at`].
 #[must_use]
 pub fn camera_at(view: &str, size: [u32; 2]) -> Option<Camera> {
     let numbers: Vec<f64> = view.trim().split(',').map(|n| n.trim().parse().ok()).collect::<Option<_>>()?;
-    let [x, y, z, heading, pitch] = numbers.try_into().ok()?;
-    let is_view = [x, y, z, heading].iter().all(|n: &f64| n.is_finite()) && (-90.0..=90.0).contains(&pitch);
+    let (&[x, y, z, heading, pitch] | &[x, y, z, heading, pitch, _]) = numbers.as_slice() else {
+        return None;
+    };
+    let is_view = numbers.iter().all(|n: &f64| n.is_finite()) && (-90.0..=90.0).contains(&pitch);
     let (heading, pitch) = (heading.to_radians(), pitch.to_radians());
     let ahead = DVec3::new(heading.sin() * pitch.cos(), heading.cos() * pitch.cos(), -pitch.sin());
     let eye = DVec3::new(x, y, z);

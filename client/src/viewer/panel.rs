@@ -1,6 +1,6 @@
 //! The panel: what can be chosen, figures, and what was clicked.
 
-use super::{Ask, Viewer, bookmarks, measure};
+use super::{Ask, Viewer, bookmarks, measure, time};
 use crate::encoding::Encoding;
 use crate::render::{Background, Colours, Shading};
 use crate::terrain::FrameView;
@@ -58,6 +58,7 @@ pub(super) fn show(viewer: &mut Viewer, ui: &mut Ui) {
             view(viewer, ui);
             light(viewer, ui);
             water(viewer, ui);
+            time::show(viewer, ui);
             annotations(viewer, ui);
             heading(ui, "Clicked");
             measure::show(viewer, ui);
@@ -69,7 +70,7 @@ pub(super) fn show(viewer: &mut Viewer, ui: &mut Ui) {
     });
 }
 
-fn heading(ui: &mut Ui, text: &str) {
+pub(super) fn heading(ui: &mut Ui, text: &str) {
     ui.add_space(8.0);
     ui.label(RichText::new(text).strong());
 }
@@ -78,8 +79,11 @@ fn scene(viewer: &mut Viewer, ui: &mut Ui) {
     let scene = viewer.terrain.scene();
     ui.heading(&scene.name);
     ui.label(RichText::new(format!("version {}", scene.version)).weak().small());
-    let names: Vec<String> = scene.layers.iter().map(|layer| layer.name.clone()).collect();
-    for (number, name) in names.iter().enumerate() {
+    // Of a series one step stands for all.
+    let position = |name: &str| scene.layers.iter().position(|layer| scene.chosen_as(&layer.name) == name);
+    let named = |name: &&str| Some((position(name)?, (*name).to_owned()));
+    let choices: Vec<(usize, String)> = scene.choices().iter().filter_map(named).collect();
+    for (number, name) in choices {
         let mut shown = viewer.terrain.is_shown(number);
         if ui.checkbox(&mut shown, name).on_hover_text("What is hidden is not fetched").changed() {
             viewer.terrain.set_shown(number, shown);
@@ -288,6 +292,9 @@ fn figures(viewer: &Viewer, ui: &mut Ui) {
     row("received", format!("{:.2} MB", stats.traffic.bytes as f64 / 1e6));
     row("requests", format!("{} in {} round trips", stats.traffic.requests, stats.traffic.round_trips));
     row("memory", format!("{:.0} MB", stats.resident_bytes as f64 / 1e6));
+    if !viewer.terrain.scene().series.is_empty() {
+        row("steps fetched ahead", stats.steps_ahead.to_string());
+    }
     if stats.texture_tiles > 0 {
         row("imagery", format!("{} tiles, {:.0} MB", stats.texture_tiles, stats.texture_bytes as f64 / 1e6));
     }
@@ -370,6 +377,7 @@ fn keys(ui: &mut Ui) {
         ("arrows", "look around"),
         ("H, N, F", "home, north, whole scene"),
         ("P, Tab, Esc", "picture, panel, clear"),
+        ("Space", "plays water in time, and stops it"),
         if cfg!(target_arch = "wasm32") {
             ("Ctrl+C", "copies the view")
         } else {

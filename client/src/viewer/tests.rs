@@ -19,7 +19,12 @@ struct Hand {
 
 impl Hand {
     fn new(camera: Option<Camera>) -> Self {
-        let served = Served::start(1, Faults::default());
+        Self::of(1, camera)
+    }
+
+    /// Over a scene with so many layers.
+    fn of(layers: usize, camera: Option<Camera>) -> Self {
+        let served = Served::start(layers, Faults::default());
         let terrain =
             Terrain::open(&served.url, Options { fetch: fetch::Options::default(), ..Options::default() });
         let viewer = Viewer::new(terrain.unwrap(), &served.url, Look::default(), SIZE, camera);
@@ -419,17 +424,102 @@ fn the_true_view_is_plain_and_can_be_left_again() {
     assert!((hand.camera().eye - eye).length() < 1e-6);
 }
 
+/// What is written in a frame, and where.
+fn texts(hand: &mut Hand, with_panel: bool) -> Vec<(String, Pos2)> {
+    let input = RawInput {
+        screen_rect: Some(Rect::from_min_size(Pos2::ZERO, vec2(SIZE[0] as f32, SIZE[1] as f32))),
+        time: Some(hand.seconds + 1.0),
+        ..RawInput::default()
+    };
+    let viewer = &mut hand.viewer;
+    let output = hand.context.run_ui(input, |ui| viewer.frame_of(ui, with_panel));
+    let texts = output.shapes.iter().filter_map(|s| match &s.shape {
+        egui::Shape::Text(text) => Some((text.galley.text().to_owned(), text.pos)),
+        _ => None,
+    });
+    let texts = texts.collect();
+    output.drop_without_applying_deltas();
+    texts
+}
+
+fn find(texts: &[(String, Pos2)], text: &str) -> Option<Pos2> {
+    texts.iter().find(|(found, _)| found == text).map(|(_, at)| *at)
+}
+
 #[test]
-fn the_panel_writes_over_the_picture() {
-    let mut hand = Hand::new(Some(looking_down()));
-    let texts = |hand: &mut Hand, with_panel: bool| -> Vec<(String, Pos2)> {
-        let input = RawInput {
-            screen_rect: Some(Rect::from_min_size(Pos2::ZERO, vec2(SIZE[0] as f32, SIZE[1] as f32))),
-            time: Some(hand.seconds + 1.0),
-            ..RawInput::default()
-        };
+fn water_plays_in_time_from_the_panel_and_its_address_tells_when() {
+    use crate::world::{BEFORE_WAVES, WAVES};
+    let mut hand = Hand::of(BEFORE_WAVES + WAVES, Some(looking_down()));
+    let is_drawn = |hand: &Hand, step: usize| {
+        let steps =
+            hand.viewer.items().into_iter().map(|item| item.layer).filter(|layer| *layer >= BEFORE_WAVES);
+        steps.collect::<std::collections::HashSet<_>>() == [BEFORE_WAVES + step].into()
+    };
+    assert!(is_drawn(&hand, 0));
+    assert!(hand.viewer.address().ends_with(",0.000"), "{}", hand.viewer.address());
+    // One box for the series, and what there is to press; the panel is longer than this window.
+    let written = texts(&mut hand, true);
+    assert!(find(&written, "waves").is_some() && find(&written, "waves.1").is_none(), "{written:?}");
+    let requests = hand.viewer.frame().stats.traffic.requests;
+    for _ in 0..20 {
+        hand.frame(&[]);
+    }
+    assert_eq!(
+        hand.viewer.frame().stats.traffic.requests,
+        requests,
+        "nothing is fetched ahead while time stands"
+    );
+    // Space plays. Ten times as fast, ten seconds take sixty frames.
+    hand.viewer.player.speed = 10.0;
+    hand.key(Key::Space, true);
+    assert!(hand.viewer.player().plays);
+    let until = Instant::now() + Duration::from_secs(60);
+    let mut seen = vec![0];
+    while hand.viewer.player().plays {
+        hand.frame(&[]);
+        let step = hand.viewer.terrain().step_drawn(0).unwrap();
+        assert!(is_drawn(&hand, step), "one step, whole, in every frame");
+        if seen.last() != Some(&step) {
+            assert!(hand.viewer.frame().complete, "time waits for what it shows");
+            seen.push(step);
+        }
+        assert!(Instant::now() < until, "{:?}", hand.viewer.player());
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    assert_eq!(seen, [0, 1, 2, 3], "each step is seen, in order");
+    assert!(hand.viewer.address().ends_with(",30.000"), "{}", hand.viewer.address());
+    // An address tells when, too, and so does a bookmark.
+    hand.viewer.keep();
+    let kept = hand.viewer.bookmarks()[0].view.clone();
+    assert!(
+        kept.ends_with(",30.000")
+            && bookmarks::read(&format!(r#"[{{"name":"a","view":"{kept}"}}]"#)).len() == 1
+    );
+    let view = hand.viewer.view();
+    let earlier = format!("{},10.5", view.rsplit_once(',').unwrap().0);
+    assert!(hand.viewer.go_to(&earlier));
+    hand.settle();
+    assert!(is_drawn(&hand, 1) && hand.viewer.player().seconds == 10.5);
+    assert!(!hand.viewer.go_to("1,2,3"));
+    assert_eq!(
+        (time_at("1,2,3,4,5"), time_at("1,2,3,4,5,-6"), time_at("1,2,3,4,5, 6")),
+        (None, None, Some(6.0))
+    );
+    assert!(camera_at("1,2,3,4,5,6", SIZE).is_some() && camera_at("1,2,3,4,5,6,7", SIZE).is_none());
+}
+
+#[test]
+fn the_panel_has_a_clock_where_water_changes_with_time_and_nowhere_else() {
+    use crate::world::{BEFORE_WAVES, WAVES};
+    // The clock alone, so that it lies within the window; what is written in it.
+    let clock = |hand: &mut Hand, events: &[Event]| -> Vec<(String, Pos2)> {
+        let size = vec2(SIZE[0] as f32, SIZE[1] as f32);
+        let screen_rect = Some(Rect::from_min_size(Pos2::ZERO, size));
+        hand.seconds += 1.0 / 60.0;
+        let (time, events) = (Some(hand.seconds), events.to_vec());
+        let input = RawInput { screen_rect, time, events, focused: true, ..RawInput::default() };
         let viewer = &mut hand.viewer;
-        let output = hand.context.run_ui(input, |ui| viewer.frame_of(ui, with_panel));
+        let output = hand.context.run_ui(input, |ui| time::show(viewer, ui));
         let texts = output.shapes.iter().filter_map(|s| match &s.shape {
             egui::Shape::Text(text) => Some((text.galley.text().to_owned(), text.pos)),
             _ => None,
@@ -438,9 +528,57 @@ fn the_panel_writes_over_the_picture() {
         output.drop_without_applying_deltas();
         texts
     };
-    let find = |texts: &[(String, Pos2)], text: &str| {
-        texts.iter().find(|(found, _)| found == text).map(|(_, at)| *at)
+    let press = |hand: &mut Hand, text: &str| {
+        let pos = find(&clock(hand, &[]), text).unwrap() + vec2(4.0, 6.0);
+        let button = |pressed| Event::PointerButton {
+            pos,
+            button: PointerButton::Primary,
+            pressed,
+            modifiers: Modifiers::NONE,
+        };
+        for event in [Event::PointerMoved(pos), button(true), button(false)] {
+            clock(hand, &[event]);
+        }
     };
+    let mut still = Hand::new(Some(looking_down()));
+    assert!(clock(&mut still, &[]).is_empty());
+    assert!(!still.viewer.address().ends_with(",0.000"), "{}", still.viewer.address());
+    let mut hand = Hand::of(BEFORE_WAVES + WAVES, Some(looking_down()));
+    assert!(find(&clock(&mut hand, &[]), "waves: step 0 of 0 to 3").is_some());
+    press(&mut hand, "+1");
+    press(&mut hand, "+1");
+    assert_eq!(hand.viewer.player().seconds, 20.0);
+    hand.frame(&[]);
+    let late = clock(&mut hand, &[]);
+    assert!(find(&late, "waves: step 0 until 2 is there").is_some(), "{late:?}");
+    hand.settle();
+    press(&mut hand, "-1");
+    hand.settle();
+    assert!(find(&clock(&mut hand, &[]), "waves: step 1 of 0 to 3").is_some());
+    press(&mut hand, "Play");
+    press(&mut hand, "loop");
+    assert!(hand.viewer.player().plays && hand.viewer.player().is_round);
+    assert!(find(&clock(&mut hand, &[]), "Pause").is_some());
+    // The slider itself: to its left end.
+    let at = find(&clock(&mut hand, &[]), "time [s]").unwrap();
+    press(&mut hand, "Pause");
+    assert!(!hand.viewer.player().plays);
+    let start = pos2(10.0, at.y + 6.0);
+    let button = |pressed| Event::PointerButton {
+        pos: start,
+        button: PointerButton::Primary,
+        pressed,
+        modifiers: Modifiers::NONE,
+    };
+    for event in [Event::PointerMoved(start), button(true), button(false)] {
+        clock(&mut hand, &[event]);
+    }
+    assert!(hand.viewer.player().seconds < 5.0, "{}", hand.viewer.player().seconds);
+}
+
+#[test]
+fn the_panel_writes_over_the_picture() {
+    let mut hand = Hand::new(Some(looking_down()));
     assert!(find(&texts(&mut hand, true), "Height [m]").is_none());
     hand.viewer.look.annotations = crate::render::Annotations::ALL;
     let beside = texts(&mut hand, true);

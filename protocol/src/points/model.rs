@@ -19,7 +19,7 @@
 
 use crate::rans::{Decoder, Encoder, PLAIN_MAX, PRECISION, TOTAL};
 use serde::{Deserialize, Serialize};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 /// Activity classes of numbers.
 pub const CLASSES: usize = 40;
@@ -149,8 +149,21 @@ pub struct Model {
     refiners: Vec<[Refiner; REFINER_PASSES]>,
     numbers: [[u16; HAZARDS]; CLASSES],
     corrections: [[u16; 2]; CORRECTION_CLASSES],
-    tables: Arc<Tables>,
+    tables: Lazy,
 }
+
+/// Tables that are made when they are first asked for: they take 0.8 MB, and of a series' steps few are decoded.
+#[derive(Debug, Clone, Default)]
+struct Lazy(Arc<OnceLock<Tables>>);
+
+impl PartialEq for Lazy {
+    /// They follow from the hazards.
+    fn eq(&self, _: &Self) -> bool {
+        true
+    }
+}
+
+impl Eq for Lazy {}
 
 #[derive(Clone, Serialize, Deserialize)]
 struct ModelParts {
@@ -238,8 +251,7 @@ impl Model {
         numbers: [[u16; HAZARDS]; CLASSES],
         corrections: [[u16; 2]; CORRECTION_CLASSES],
     ) -> Self {
-        let tables = Arc::new(Tables::new(&numbers, &corrections));
-        Self { levels, refiners, numbers, corrections, tables }
+        Self { levels, refiners, numbers, corrections, tables: Lazy::default() }
     }
 
     /// With these kernels and refiners, and hazards that know nothing of the layer.
@@ -262,10 +274,15 @@ impl Model {
         &self.levels[at][way]
     }
 
-    /// The tables that the hazards give.
+    /// Leaves its tables to its clones.
+    pub(super) fn rest(&mut self) {
+        self.tables = Lazy::default();
+    }
+
+    /// The tables that the hazards give, which all clones of this share.
     #[must_use]
     pub fn tables(&self) -> &Tables {
-        &self.tables
+        self.tables.0.get_or_init(|| Tables::new(&self.numbers, &self.corrections))
     }
 
     /// The kernels by level.

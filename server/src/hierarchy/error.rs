@@ -7,6 +7,7 @@ use crate::texture::TextureError;
 use diamantina_protocol::bintree::ForestError;
 use diamantina_protocol::message::PAYLOAD_BYTES_MAX;
 use diamantina_protocol::points::{CodingError, SOURCE_MAX};
+use diamantina_protocol::series::SeriesError;
 use diamantina_protocol::texture::TEXTURES_MAX;
 use diamantina_protocol::tin::PatchError;
 use diamantina_protocol::zone::LAYERS_MAX;
@@ -53,8 +54,13 @@ pub enum BuildError {
     #[error("--texture-quality {0}: expected 1 to 100")]
     TextureQuality(u8),
     /// More than a scene may have.
-    #[error("{0} layers, expected at most {LAYERS_MAX}: build several scenes")]
+    #[error(
+        "{0} layers, the steps of series among them, expected at most {LAYERS_MAX}: build several scenes"
+    )]
     Layers(usize),
+    /// Series that are none.
+    #[error(transparent)]
+    Series(#[from] SeriesError),
     /// No name, or that of another layer.
     #[error(
         "layer '{0}': expected a name that no other layer or texture has, of 1 to 64 letters, digits, '-', '_' or '.', not starting \

@@ -71,7 +71,7 @@ impl Build<'_> {
             max_error: options.max_error,
             finest_error: finest,
             encodings: if options.points { vec!["points".to_owned()] } else { Vec::new() },
-            coding: self.coding.clone(),
+            coding: self.coding.rested(),
             bytes: point_bytes + index_bytes,
             resampled: self.grid.resampled,
             errors: "exact".to_owned(),

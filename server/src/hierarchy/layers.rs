@@ -5,10 +5,11 @@
 
 use super::plan::{Plan, held_bytes};
 use super::transcribe::find_quantum;
-use super::{BuildError, Options, forest_of, tins};
+use super::{BuildError, Content, Options, forest_of, tins};
 use crate::ingest::{IngestError, Source};
-use crate::texture::{TextureSource, describe};
+use crate::texture::describe;
 use diamantina_protocol::message::{Kind, is_name};
+use diamantina_protocol::series::Series;
 use diamantina_protocol::texture::TEXTURES_MAX;
 use diamantina_protocol::zone::LAYERS_MAX;
 
@@ -128,12 +129,18 @@ fn check(layers: &[LayerSource<'_>]) -> Result<(), BuildError> {
     Ok(())
 }
 
+/// Refuses series that no scene with these layers can have.
+pub(super) fn check_series(layers: &[LayerSource<'_>], series: &[Series]) -> Result<(), BuildError> {
+    if let Some(series) = series.iter().find(|series| !is_name(&series.name) || series.name == "zones") {
+        return Err(BuildError::LayerName(series.name.clone()));
+    }
+    Series::positions(series, layers.iter().map(|layer| (layer.name, layer.kind == Kind::Water)))?;
+    Ok(())
+}
+
 /// Refuses textures that no scene with these layers can have.
-pub(super) fn check_textures(
-    layers: &[LayerSource<'_>],
-    textures: &[TextureSource<'_>],
-    options: &Options,
-) -> Result<(), BuildError> {
+pub(super) fn check_textures(content: &Content<'_>, options: &Options) -> Result<(), BuildError> {
+    let Content { layers, textures, series } = content;
     if !(1..=100).contains(&options.texture_quality) {
         return Err(BuildError::TextureQuality(options.texture_quality));
     }
@@ -143,6 +150,7 @@ pub(super) fn check_textures(
     for (number, texture) in textures.iter().enumerate() {
         // They stand in the same place of addresses.
         let is_taken = layers.iter().any(|layer| layer.name == texture.name)
+            || series.iter().any(|series| series.name == texture.name)
             || textures[..number].iter().any(|other| other.name == texture.name);
         if is_taken || !is_name(texture.name) || texture.name == "zones" {
             return Err(BuildError::LayerName(texture.name.to_owned()));

@@ -41,9 +41,10 @@ use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::index::Entry;
 use diamantina_protocol::message::{Frame, Layer, Scene, TinLayer};
 use diamantina_protocol::points::{Coding, Rule};
+use diamantina_protocol::series::Series;
 use diamantina_protocol::texture::Texture;
 use index::Sums;
-use layers::{Part, check_textures, parts};
+use layers::{Part, check_series, check_textures, parts};
 use plan::Plan;
 use std::collections::HashSet;
 use std::path::Path;
@@ -176,26 +177,38 @@ pub fn build_layers(
     options: &Options,
     progress: &Progress,
 ) -> Result<Report, BuildError> {
-    build_scene(layers, &[], out, options, progress)
+    build_scene(Content { layers, ..Content::default() }, out, options, progress)
 }
 
-/// As [`build_layers`], with textures, which lie in the same frame.
+/// What a scene is made of.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Content<'a> {
+    /// Its surfaces.
+    pub layers: &'a [LayerSource<'a>],
+    /// Its imagery, which lies in the same frame.
+    pub textures: &'a [TextureSource<'a>],
+    /// Which of the layers are the steps of a surface that changes with time.
+    pub series: &'a [Series],
+}
+
+/// As [`build_layers`], with textures, and with layers that are the steps of series.
 ///
 /// # Errors
 /// As [`build_layers`].
 pub fn build_scene(
-    layers: &[LayerSource<'_>],
-    textures: &[TextureSource<'_>],
+    content: Content<'_>,
     out: &Path,
     options: &Options,
     progress: &Progress,
 ) -> Result<Report, BuildError> {
     let started = Instant::now();
     // Wrong use is refused before an earlier run's work is touched.
+    let Content { layers, series, .. } = content;
     let parts = parts(layers, options)?;
-    check_textures(layers, textures, options)?;
+    check_series(layers, series)?;
+    check_textures(&content, options)?;
     let writer = Writer::create(out)?;
-    let built = run(&parts, textures, &writer, options, progress);
+    let built = run(&parts, &content, &writer, options, progress);
     progress.finish();
     match built {
         Ok((scene, sums)) => Ok(report(scene, &sums, started)),
@@ -220,16 +233,18 @@ fn forest_of(grid: &Grid, options: &Options) -> Result<Forest, BuildError> {
 /// Reads, codes, indexes and publishes; the scene, and what coding gave of each layer.
 fn run(
     parts: &[Part<'_>],
-    textures: &[TextureSource<'_>],
+    content: &Content<'_>,
     writer: &Writer,
     options: &Options,
     progress: &Progress,
 ) -> Result<(Scene, Vec<Sums>), BuildError> {
     let (work, begun) = work::open(writer, parts, options, progress)?;
     let mut read = Vec::with_capacity(parts.len());
-    for (part, (canvas, before)) in parts.iter().zip(begun) {
+    for (part, before) in parts.iter().zip(begun) {
         progress.of(part.label());
         let found = || -> Result<(Stats, u32), BuildError> {
+            // One at a time: a series has more files than a program may have open.
+            let canvas = work.canvas(part)?;
             let stats = transcribe(part, &canvas, &before.bands, &work)?;
             // What is noted of this canvas must not wait for a checkpoint of another.
             if parts.len() > 1 {
@@ -239,17 +254,17 @@ fn run(
             Ok((stats, fine_step))
         };
         let (stats, fine_step) = found().map_err(|error| part.failed(error))?;
-        read.push((canvas, before, stats, fine_step));
+        read.push((before, stats, fine_step));
     }
     let (mut layers, mut sums) = (Vec::with_capacity(parts.len()), Vec::with_capacity(parts.len()));
-    for (part, (canvas, before, stats, fine_step)) in parts.iter().zip(read) {
+    for (part, (before, stats, fine_step)) in parts.iter().zip(read) {
         progress.of(part.label());
-        let built = build_layer(part, canvas, before, &stats, fine_step, &work);
+        let built = build_layer(part, work.canvas(part)?, before, &stats, fine_step, &work);
         let (layer, sum) = built.map_err(|error| part.failed(error))?;
         layers.push(layer);
         sums.push(sum);
     }
-    let textures = build_textures(textures, writer, options, &work)?;
+    let textures = build_textures(content.textures, writer, options, &work)?;
     progress.of(None);
     let bytes =
         layers.iter().map(|layer| layer.bytes).chain(textures.iter().map(|texture| texture.bytes)).sum();
@@ -261,6 +276,7 @@ fn run(
         layers,
         zones: Vec::new(),
         textures,
+        series: content.series.to_vec(),
     };
     let go_on = |bytes| {
         progress.advance(bytes);

@@ -39,6 +39,13 @@ pub(super) struct Before {
 }
 
 impl Work<'_> {
+    /// The canvas of a layer.
+    pub(super) fn canvas(&self, part: &Part<'_>) -> Result<Canvas, BuildError> {
+        let gone = || io::Error::new(io::ErrorKind::NotFound, "planes of a layer are gone");
+        let canvas = reopen(self.writer.work_folder(), part).and_then(|canvas| canvas.ok_or_else(gone));
+        canvas.map_err(self.failure())
+    }
+
     /// Puts on the disk what is done.
     pub(super) fn checkpoint(&self, canvas: &Canvas) -> Result<(), BuildError> {
         self.checkpoint_with(canvas, || Ok(()))
@@ -117,16 +124,13 @@ fn folder_of(work: &Path, part: &Part<'_>) -> PathBuf {
     work.join(format!("layer-{}", part.number))
 }
 
-/// Of each layer its canvas, and what is done of it.
-type Begun = Vec<(Canvas, Before)>;
-
 /// Goes on with what an earlier run left, if it is of the same build, or begins anew; says which.
 pub(super) fn open<'a>(
     writer: &'a Writer,
     parts: &[Part<'_>],
     options: &Options,
     progress: &'a Progress,
-) -> Result<(Work<'a>, Begun), BuildError> {
+) -> Result<(Work<'a>, Vec<Before>), BuildError> {
     let mut nothing = Vec::with_capacity(parts.len());
     let mut chunks = 0;
     for part in parts {
@@ -141,10 +145,10 @@ pub(super) fn open<'a>(
     let left = Journal::exists(folder);
     if left && !options.fresh {
         let mut before = nothing;
-        if let Some((journal, canvases)) = resume(writer, parts, &mut before, &fingerprint, options)? {
+        if let Some(journal) = resume(writer, parts, &mut before, &fingerprint, options)? {
             progress.say(&words(parts, &before, chunks));
             let done = before.iter().map(Before::done).sum();
-            return Ok((work(journal, done), canvases.into_iter().zip(before).collect()));
+            return Ok((work(journal, done), before));
         }
         // Nothing was taken from a journal of another build.
         nothing = before;
@@ -159,14 +163,20 @@ pub(super) fn open<'a>(
     }
     writer.clear()?;
     let failed = failure(writer);
-    let canvas = |part: &Part<'_>| {
+    for part in parts {
         let (folder, Grid { width, height, .. }) = (folder_of(folder, part), part.layer.source.grid());
-        std::fs::create_dir_all(&folder)?;
-        Canvas::create(&folder, *width, *height, part.plan.coarsest())
-    };
-    let canvases: Vec<Canvas> = parts.iter().map(canvas).collect::<io::Result<_>>().map_err(&failed)?;
+        let made = std::fs::create_dir_all(&folder)
+            .and_then(|()| Canvas::create(&folder, *width, *height, part.plan.coarsest()));
+        made.map_err(&failed)?;
+    }
     let journal = Journal::create(folder, &fingerprint, options.checkpoint).map_err(&failed)?;
-    Ok((work(journal, 0), canvases.into_iter().zip(nothing).collect()))
+    Ok((work(journal, 0), nothing))
+}
+
+/// The canvas of a layer that was begun; `None` if it is not there as it should be.
+fn reopen(work: &Path, part: &Part<'_>) -> io::Result<Option<Canvas>> {
+    let Grid { width, height, .. } = part.layer.source.grid();
+    Canvas::reopen(&folder_of(work, part), *width, *height, part.plan.coarsest())
 }
 
 /// Adds to `before` what an earlier run of the same build left; `None`, with nothing added, if there is none that can be
@@ -177,15 +187,13 @@ fn resume(
     before: &mut [Before],
     fingerprint: &Fingerprint,
     options: &Options,
-) -> Result<Option<(Journal, Vec<Canvas>)>, BuildError> {
+) -> Result<Option<Journal>, BuildError> {
     let folder = writer.work_folder();
     let failed = failure(writer);
-    let mut canvases = Vec::with_capacity(parts.len());
     for part in parts {
-        let Grid { width, height, .. } = part.layer.source.grid();
-        let canvas = Canvas::reopen(&folder_of(folder, part), *width, *height, part.plan.coarsest());
-        let Some(canvas) = canvas.map_err(&failed)? else { return Ok(None) };
-        canvases.push(canvas);
+        if reopen(folder, part).map_err(&failed)?.is_none() {
+            return Ok(None);
+        }
     }
     let take = |layer: u8, record| {
         let number = usize::from(layer);
@@ -201,7 +209,7 @@ fn resume(
     let journal = Journal::reopen(folder, fingerprint, options.checkpoint, take, &failed)?;
     let Some(journal) = journal else { return Ok(None) };
     writer.settle()?;
-    Ok(Some((journal, canvases)))
+    Ok(Some(journal))
 }
 
 /// How far the earlier runs came.

@@ -66,7 +66,7 @@ pub enum StoreError {
     },
     /// The description would be too long to be read again.
     #[error(
-        "{path}: {SCENE_FILE} would have {found} bytes, at most {SCENE_BYTES_MAX}: give its zones fewer corners"
+        "{path}: {SCENE_FILE} would have {found} bytes, at most {SCENE_BYTES_MAX}: give its zones fewer corners, or its series fewer steps"
     )]
     Description {
         /// The store.

@@ -28,7 +28,7 @@ pub const FORMAT: u32 = 3;
 pub(super) const BLOB_BYTES_MAX: u32 = 16 << 20;
 
 /// The largest `scene.json`, in bytes.
-pub(super) const SCENE_BYTES_MAX: u64 = 4 << 20;
+pub(super) const SCENE_BYTES_MAX: u64 = 16 << 20;
 
 const MAGIC: &[u8; 8] = b"DMTDIR01";
 const ENTRY_BYTES: usize = 32;

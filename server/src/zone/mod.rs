@@ -255,25 +255,27 @@ pub fn add(root: &Path, options: &Options, progress: &Progress) -> Result<Report
     }
     let polygons = polygon::read(&options.polygon, scene.frame.crs.as_ref(), options.coordinates)?;
     check_memory(scene, options)?;
-    let grounds = read(store, progress)?;
+    let (grounds, highest) = read(store, &polygons, progress)?;
     refuse_outside(scene, &grounds, &polygons, options)?;
     let seconds_reading = started.elapsed().as_secs_f64();
-    let parts = parts(&grounds, &polygons, options)?;
+    let parts = parts(&grounds, &highest, &polygons, options)?;
     let (eyes, spacing) = eyes(&grounds, &parts, options)?;
     let mut tally = Tally::default();
     let mut masks = Vec::with_capacity(grounds.len());
     progress.stage("zone", "eyes", (eyes.len() * grounds.len()) as u64, 0);
-    for (layer, ground) in scene.layers.iter().zip(&grounds) {
-        let shares = match layer.kind {
-            Kind::Terrain => {
+    let mut grounds = grounds.iter();
+    for layer in &scene.layers {
+        let ground = if is_step(scene, layer) { None } else { grounds.next() };
+        let shares = match (layer.kind, ground) {
+            (Kind::Terrain, Some(ground)) => {
                 tally.azimuths +=
                     eyes.iter().map(|(p, z)| azimuths(ground, ground.eye(*p, *z), options)).sum::<u64>();
                 shares(ground, &polygons, &eyes, options, progress).ok_or(ZoneError::Interrupted)?
             }
             // Water is seen through, so it hides nothing, itself included; and what ground hides of it is not looked at.
-            Kind::Water => {
-                progress.advance(eyes.len() as u64);
-                Tiled::filled(ground.relief.size(), u8::MAX)
+            _ => {
+                progress.advance(if ground.is_some() { eyes.len() as u64 } else { 0 });
+                Tiled::filled(layer.samples.map(|side| side as usize), u8::MAX)
             }
         };
         tally.count(&shares, pack(options.hidden));
@@ -377,8 +379,11 @@ fn check(options: &Options) -> Result<(), ZoneError> {
 }
 
 fn check_memory(scene: &Scene, options: &Options) -> Result<(), ZoneError> {
-    let samples: u64 =
-        scene.layers.iter().map(|l| l.samples.iter().map(|s| u64::from(*s)).product::<u64>()).sum();
+    let of = |layer: &Layer| layer.samples.iter().map(|s| u64::from(*s)).product::<u64>();
+    let (steps, others): (Vec<&Layer>, Vec<&Layer>) =
+        scene.layers.iter().partition(|layer| is_step(scene, layer));
+    // One step of a series after the other.
+    let samples: u64 = others.into_iter().map(of).sum::<u64>() + steps.into_iter().map(of).max().unwrap_or(0);
     let diamonds: u64 = scene.layers.iter().map(|l| zone::bytes_max(&[l.forest]) as u64).max().unwrap_or(0);
     // Readers of chunks are done before rays are cast.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "below 2^60, and an estimate")]
@@ -391,9 +396,20 @@ fn check_memory(scene: &Scene, options: &Options) -> Result<(), ZoneError> {
     Ok(())
 }
 
-/// The finest surfaces of all layers.
-fn read(store: &Store, progress: &Progress) -> Result<Vec<Ground>, ZoneError> {
-    let layers = &store.scene().layers;
+/// Whether a layer is a step of a series.
+fn is_step(scene: &Scene, layer: &Layer) -> bool {
+    scene.series.iter().any(|series| series.layers.contains(&layer.name))
+}
+
+/// Of each polygon the highest that is known of it so far.
+type Highest = Vec<Option<f64>>;
+
+/// The finest surfaces of all layers but the steps of series, and how high those are in the polygons: steps hide nothing,
+/// and all of them at once would take as many times the memory.
+fn read(store: &Store, polygons: &[Rings], progress: &Progress) -> Result<(Vec<Ground>, Highest), ZoneError> {
+    let scene = store.scene();
+    let layers = &scene.layers;
+    let mut highest = vec![None; polygons.len()];
     progress.stage("read", "layers", layers.len() as u64, 0);
     let mut grounds = Vec::with_capacity(layers.len());
     for (number, layer) in layers.iter().enumerate() {
@@ -404,19 +420,23 @@ fn read(store: &Store, progress: &Progress) -> Result<Vec<Ground>, ZoneError> {
         }
         let relief = Relief::read(store, u8::try_from(number).unwrap_or(u8::MAX), layer)?;
         let Layer { origin, cell, quantum, height_offset, .. } = layer;
-        grounds.push(Ground {
-            relief,
-            origin: *origin,
-            cell: *cell,
-            quantum: *quantum,
-            height_offset: *height_offset,
-        });
+        let ground =
+            Ground { relief, origin: *origin, cell: *cell, quantum: *quantum, height_offset: *height_offset };
+        if is_step(scene, layer) {
+            for (rings, highest) in polygons.iter().zip(&mut highest) {
+                let held = ground.holds(std::slice::from_ref(rings));
+                let here = if held { ground.highest(rings) } else { None };
+                *highest = (*highest).into_iter().chain(here).reduce(f64::max);
+            }
+        } else {
+            grounds.push(ground);
+        }
         progress.advance(1);
         if progress.is_stopping() {
             return Err(ZoneError::Interrupted);
         }
     }
-    Ok(grounds)
+    Ok((grounds, highest))
 }
 
 /// A zone lies within the terrain; other layers may reach less far.
@@ -442,10 +462,16 @@ fn refuse_outside(
 }
 
 /// The polygons with their ceilings.
-fn parts(grounds: &[Ground], polygons: &[Rings], options: &Options) -> Result<Vec<Part>, ZoneError> {
+fn parts(
+    grounds: &[Ground],
+    steps: &Highest,
+    polygons: &[Rings],
+    options: &Options,
+) -> Result<Vec<Part>, ZoneError> {
     let part = |(i, rings): (usize, &Rings)| {
         let held = grounds.iter().filter(|ground| ground.holds(std::slice::from_ref(rings)));
-        let highest = held.filter_map(|ground| ground.highest(rings)).chain(options.level).reduce(f64::max);
+        let all = held.filter_map(|ground| ground.highest(rings)).chain(steps[i]).chain(options.level);
+        let highest = all.reduce(f64::max);
         let bottomless = || ZoneError::Bottomless { path: options.polygon.clone(), number: i + 1 };
         let ceiling = highest.ok_or_else(bottomless)? + options.eye;
         Ok(Part { ceiling: (ceiling * 1e3).ceil() / 1e3, rings: rings.clone() })
