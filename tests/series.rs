@@ -72,7 +72,8 @@ fn each_step_of_a_series_is_the_picture_of_a_scene_of_that_step_alone() {
     assert!(last == alone, "the step that began at 20 s is the file with the highest number");
     let other = first.chunks(4).zip(last.chunks(4)).filter(|(a, b)| a != b).count();
     assert!(other > 1000, "{other} pixels differ");
-    assert_eq!([&of_first["time_seconds"], &of_last["time_seconds"]], [&0.0.into(), &25.0.into()]);
+    let times = serde_json::json!([of_first["time_seconds"], of_last["time_seconds"]]);
+    assert_eq!(times, serde_json::json!([0.0, 25.0]));
     assert!(of_alone["time_seconds"].is_null());
     // On a flight time goes on, and each frame waits for what it shows.
     let fly = format!("fly {} --frames 5 --size 160x90 --settle 30 --play 2 --csv -", served.scene("waves"));
