@@ -167,7 +167,7 @@ mod tests {
             (vec![series("sea", &["sea.2"], 1.0)], "'sea.2' is no layer"),
             (vec![series("sea", &["terrain"], 1.0)], "is ground"),
             (vec![series("sea", &["sea.0", "sea.0"], 1.0)], "is a step already"),
-            (vec![sea.clone(), series("lake", &["sea.0"], 1.0)], "is a step already"),
+            (vec![sea, series("lake", &["sea.0"], 1.0)], "is a step already"),
             (vec![series("sea", &["sea.0"], 0.0)], "steps of 0 s"),
             (vec![series("sea", &["sea.0"], f64::NAN)], "NaN"),
             (vec![series("sea", &["sea.0"], f64::INFINITY)], "steps of inf s"),
