@@ -260,7 +260,7 @@ fn an_address_opens_the_same_view_again() {
     again.viewer.set_exaggeration(2.5);
     let [a, b] = [&hand, &again].map(Hand::camera);
     assert!((a.eye - b.eye).length() < 0.1, "{} {}", a.eye, b.eye);
-    for wrong in ["", "1,2,3", "1,2,3,4,x", "1,2,nan,0,0", "1,2,3,0,95", "1,2,3,4,5,6"] {
+    for wrong in ["", "1,2,3", "1,2,3,4,x", "1,2,nan,0,0", "1,2,3,0,95", "1,2,3,4,5,x", "1,2,3,4,5,6,7"] {
         assert!(camera_at(wrong, SIZE).is_none(), "{wrong}");
     }
 }
