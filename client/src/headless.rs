@@ -11,7 +11,6 @@ use crate::player::{self, Course};
 use crate::render::{self, FrameStats, Look, Offscreen, RenderError};
 use crate::surface::Surface;
 use crate::terrain::{FrameView, Stats, Terrain, TerrainError};
-use crate::texture::Coding;
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::message::{Layer, Scene};
@@ -212,13 +211,6 @@ pub struct PictureReport {
     pub milliseconds_a_frame: f64,
 }
 
-/// Has imagery come as what draws it takes it.
-fn fit(terrain: &mut Terrain, offscreen: &Offscreen) {
-    if !offscreen.reads_blocks() {
-        terrain.set_texture_coding(Coding::Plain);
-    }
-}
-
 /// Streams until the camera's view is as exact as asked, and draws it. Gives up waiting after `patience`
 /// and draws what is there. Where the look stretches heights, the camera's are stretched, too.
 ///
@@ -232,7 +224,7 @@ pub fn picture(
     patience: Duration,
 ) -> Result<(Picture, PictureReport), HeadlessError> {
     let mut offscreen = Offscreen::new(options)?;
-    fit(terrain, &offscreen);
+    terrain.suit_blocks(offscreen.reads_blocks());
     let drawn = stretched(camera, look.exaggeration);
     terrain.set_exaggeration(look.exaggeration);
     terrain.set_wires(look.wireframe);
@@ -654,7 +646,7 @@ pub fn fly(
     mut each: impl FnMut(&FrameLine, Option<&Picture>) -> Result<(), HeadlessError>,
 ) -> Result<(), HeadlessError> {
     let mut offscreen = Offscreen::new(options)?;
-    fit(terrain, &offscreen);
+    terrain.suit_blocks(offscreen.reads_blocks());
     terrain.set_exaggeration(look.exaggeration);
     // Of a version of the scene.
     let mut annotator: Option<(String, Annotator)> = None;

@@ -83,11 +83,11 @@ impl Terrain {
         Draping::start(number, texture, *texture_bytes, *texture_coding, *fade_seconds)
     }
 
-    /// How the texels of imagery are to be coded from now on: as whatever draws them takes them. Tiles that are there
-    /// come again, from the disk cache if there is one.
-    pub fn set_texture_coding(&mut self, coding: Coding) {
-        if self.options.texture_coding != coding {
-            self.options.texture_coding = coding;
+    /// Says whether what draws imagery is to have it in blocks: if not, it comes plain, whatever was asked for. Tiles that are
+    /// there come again, from the disk cache if there is one.
+    pub fn suit_blocks(&mut self, suits: bool) {
+        if !suits && self.options.texture_coding != Coding::Plain {
+            self.options.texture_coding = Coding::Plain;
             let number = self.texture();
             self.start_draping(number);
         }

@@ -134,7 +134,7 @@ impl Display {
     /// Draws a frame, with the panel or, for a picture, without; how long until the next is wanted.
     pub(crate) fn draw(&mut self, viewer: &mut Viewer, with_panel: bool) -> Duration {
         viewer.resize([self.configuration.width, self.configuration.height]);
-        viewer.fit(self.suits_blocks);
+        viewer.suit_blocks(self.suits_blocks);
         let input = self.input.take_egui_input(&self.window);
         let context = self.input.egui_ctx().clone();
         let mut output = context.run_ui(input, |ui| viewer.frame_of(ui, with_panel));

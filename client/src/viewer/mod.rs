@@ -41,7 +41,7 @@ use crate::pick::{Hit, Picker, Ray};
 use crate::player::Player;
 use crate::render::{FrameStats, Look};
 use crate::terrain::{FrameView, Terrain};
-use crate::texture::{Coding, Drape};
+use crate::texture::Drape;
 use bookmarks::Bookmarks;
 use diamantina_protocol::message::Kind;
 use egui::{Event, Key, Modifiers, Painter, PointerButton, Rect, Sense, Ui};
@@ -173,11 +173,9 @@ impl Viewer {
         &self.terrain
     }
 
-    /// Has imagery come as suits what draws it.
-    pub fn fit(&mut self, suits_blocks: bool) {
-        if !suits_blocks {
-            self.terrain.set_texture_coding(Coding::Plain);
-        }
+    /// See [`Terrain::suit_blocks`].
+    pub fn suit_blocks(&mut self, suits: bool) {
+        self.terrain.suit_blocks(suits);
     }
 
     /// What the last frame shows.
