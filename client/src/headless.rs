@@ -271,7 +271,8 @@ impl Annotator {
     ) {
         let centre = annotate::centre(&mut self.picker, &terrain.scene().layers, items, look, camera);
         let layers = terrain.drawn_layers();
-        let subject = Subject { camera, look, layers: &layers, globe: self.globe.as_ref(), centre };
+        let (imagery, globe) = (terrain.texture_name(), self.globe.as_ref());
+        let subject = Subject { camera, look, layers: &layers, imagery, globe, centre };
         offscreen.draw_over(annotate::pixels_per_point(camera.size), |painter, area| {
             annotate::show(painter, area, &subject);
         });
@@ -310,7 +311,7 @@ fn report(
         largest_error_pixels: view.error_pixels,
         zone: terrain.zone().map(|zone| zone.name.clone()),
         zone_in_effect: view.stats.zone_in_effect,
-        texture: terrain.texture().map(|number| terrain.scene().textures[number].name.clone()),
+        texture: terrain.texture_name().map(str::to_owned),
         texture_tiles: view.stats.texture_tiles,
         time_seconds: (!terrain.scene().series.is_empty()).then(|| terrain.time()),
         complete: view.complete,

@@ -1,7 +1,7 @@
 //! A legend: what colours mean, with units, for each layer that is drawn.
 
 use super::{Ink, Subject, put, round_down, text, value};
-use crate::render::{Look, Quantity, Scale, Shading, water_colour};
+use crate::render::{Quantity, Scale, Shading, water_colour};
 use diamantina_protocol::message::{Kind, Layer};
 use egui::{Align2, Color32, Mesh, Painter, Rect, Shape, Stroke, StrokeKind, Vec2, pos2, vec2};
 
@@ -34,13 +34,21 @@ pub(super) fn show(painter: &Painter, area: Rect, ink: &Ink, subject: &Subject<'
     }
     for (i, layer) in shown.iter().enumerate().rev() {
         let below = if i + 1 == shown.len() { &water[..] } else { &[] };
-        let taken = ramp(painter, left, ink, look, layer, below);
+        let taken = ramp(painter, left, ink, subject, layer, below);
         left.set_right(left.right() - taken - 6.0);
     }
 }
 
 /// The legend of a layer; how wide it is.
-fn ramp(painter: &Painter, area: Rect, ink: &Ink, look: &Look, layer: &Layer, water: &[&Layer]) -> f32 {
+fn ramp(
+    painter: &Painter,
+    area: Rect,
+    ink: &Ink,
+    subject: &Subject<'_>,
+    layer: &Layer,
+    water: &[&Layer],
+) -> f32 {
+    let look = subject.look;
     let scale = Scale::of(look, layer);
     let heading = text(painter, layer.name.as_str(), 13.0, ink.text);
     let unit = text(painter, unit(&scale), 12.0, ink.text);
@@ -49,9 +57,12 @@ fn ramp(painter: &Painter, area: Rect, ink: &Ink, look: &Look, layer: &Layer, wa
         let note = format!("lit from {:.0}°, {:.0}° high", sun.azimuth_degrees, sun.altitude_degrees);
         text(painter, note, 10.5, ink.faint)
     });
+    // Imagery has colours of its own, and may cover a part alone.
+    let except = subject.imagery.map(|name| text(painter, format!("but not under {name}"), 10.5, ink.faint));
     let waters: Vec<_> =
         water.iter().map(|layer| text(painter, layer.name.as_str(), 12.0, ink.text)).collect();
-    let head = heading.size().y + unit.size().y + light.as_ref().map_or(0.0, |note| note.size().y) + 6.0;
+    let notes = [light.as_ref(), except.as_ref()].into_iter().flatten();
+    let head = heading.size().y + unit.size().y + notes.map(|note| note.size().y).sum::<f32>() + 6.0;
     let foot = 20.0 * waters.len() as f32;
     let wedges = scale.beyond().map(|beyond| if beyond { WEDGE } else { 0.0 });
     let room = area.height() - 2.0 * super::PADDING - head - foot - wedges[0] - wedges[1] - SPACING;
@@ -60,14 +71,14 @@ fn ramp(painter: &Painter, area: Rect, ink: &Ink, look: &Look, layer: &Layer, wa
     let labels: Vec<_> =
         labels.into_iter().map(|(at, label)| (at, text(painter, label, 12.0, ink.text))).collect();
     let widest = labels.iter().map(|(_, label)| label.size().x).fold(0.0, f32::max);
-    let texts = [Some(&heading), Some(&unit), light.as_ref()];
+    let texts = [Some(&heading), Some(&unit), light.as_ref(), except.as_ref()];
     let texts = texts.into_iter().flatten().map(|galley| galley.size().x);
     let swatch = waters.iter().map(|galley| BAR.x + 7.0 + galley.size().x);
     let width = texts.chain(swatch).fold(BAR.x + 7.0 + widest, f32::max);
     let height = head + wedges[0] + wedges[1] + bar_height + SPACING + foot;
     let rect = ink.plate(painter, area, Align2::RIGHT_BOTTOM, vec2(width, height));
     let mut y = rect.top();
-    for galley in [Some(heading), Some(unit), light].into_iter().flatten() {
+    for galley in [Some(heading), Some(unit), light, except].into_iter().flatten() {
         let next = y + galley.size().y;
         put(painter, pos2(rect.left(), y), Align2::LEFT_TOP, galley);
         y = next;

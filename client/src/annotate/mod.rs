@@ -47,6 +47,8 @@ pub struct Subject<'a> {
     pub look: &'a Look,
     /// The layers that are drawn.
     pub layers: &'a [Layer],
+    /// The name of the imagery that lies on the ground, if any does.
+    pub imagery: Option<&'a str>,
     /// Where the frame lies on the globe, if that is known: else the y axis is north, and metres are the frame's.
     pub globe: Option<&'a Globe>,
     /// What is seen in the middle of the picture, as [`centre`] finds it.

@@ -21,7 +21,7 @@ fn pixel_of(camera: &Camera, place: DVec3) -> DVec2 {
 }
 
 fn subject<'a>(camera: &'a Camera, look: &'a Look) -> Subject<'a> {
-    Subject { camera, look, layers: &[], globe: None, centre: Some(camera.target) }
+    Subject { camera, look, layers: &[], imagery: None, globe: None, centre: Some(camera.target) }
 }
 
 #[test]
@@ -134,6 +134,11 @@ fn labels_are_round_and_stand_at_their_values() {
 
 /// Texts of a frame with these annotations.
 fn texts(annotations: Annotations, layers: &[Layer], look: Look) -> Vec<String> {
+    texts_over(None, annotations, layers, look)
+}
+
+/// The same where imagery of this name lies on the ground.
+fn texts_over(imagery: Option<&str>, annotations: Annotations, layers: &[Layer], look: Look) -> Vec<String> {
     let context = egui::Context::default();
     let camera = camera(20.0, 40.0);
     let look = Look { annotations, ..look };
@@ -142,7 +147,7 @@ fn texts(annotations: Annotations, layers: &[Layer], look: Look) -> Vec<String> 
         ..egui::RawInput::default()
     };
     let output = context.run_ui(input, |ui| {
-        show(ui.painter(), ui.max_rect(), &Subject { layers, ..subject(&camera, &look) });
+        show(ui.painter(), ui.max_rect(), &Subject { layers, imagery, ..subject(&camera, &look) });
     });
     let texts = output.shapes.iter().filter_map(|clipped| match &clipped.shape {
         egui::Shape::Text(text) => {
@@ -169,6 +174,8 @@ fn what_is_written_is_what_was_asked_for() {
     let north = Annotations { north_arrow: true, ..Annotations::default() };
     assert_eq!(texts(north, &layers, Look::default()), ["N"]);
     let legend = Annotations { legend: true, ..Annotations::default() };
+    let photo = texts_over(Some("photo"), legend, &layers, Look::default());
+    assert!(photo.iter().any(|text| text == "but not under photo"), "{photo:?}");
     let slope = texts(legend, &layers, Look { colours: Colours::Slope, ..Look::default() }.truthful());
     for text in ["Slope [°]", "60", "lit from 315°, 45° high"] {
         assert!(slope.iter().any(|found| found == text), "{text} in {slope:?}");

@@ -54,6 +54,12 @@ impl Terrain {
         self.draping.as_ref().map(Draping::number)
     }
 
+    /// The name of that texture.
+    #[must_use]
+    pub fn texture_name(&self) -> Option<&str> {
+        self.texture().map(|number| self.scene.textures[number].name.as_str())
+    }
+
     /// Lays the texture at a position in the scene on the terrain, or none.
     pub fn set_texture(&mut self, number: Option<usize>) {
         let number = number.filter(|number| *number < self.scene.textures.len());

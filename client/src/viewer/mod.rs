@@ -329,8 +329,8 @@ impl Viewer {
         let layers = &self.terrain.scene().layers;
         let centre = annotate::centre(&mut self.picker, layers, &items, &self.look, camera);
         let layers = self.terrain.drawn_layers();
-        let globe = self.globe.as_ref();
-        let subject = Subject { camera, look: &self.look, layers: &layers, globe, centre };
+        let (imagery, globe) = (self.terrain.texture_name(), self.globe.as_ref());
+        let subject = Subject { camera, look: &self.look, layers: &layers, imagery, globe, centre };
         annotate::show(painter, area, &subject);
     }
 
