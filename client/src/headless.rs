@@ -1,39 +1,32 @@
-//! Pictures and flights without a window.
+//! Pictures and flights without a window: pictures here, paths in `path`, flights along them in `fly`.
 
 use crate::annotate::{self, Subject};
-use crate::camera::{Camera, FOV_Y};
+use crate::camera::Camera;
 use crate::drawing::DrawItem;
 use crate::globe::Globe;
 use crate::overview::{around, stretched};
 use crate::pick::Picker;
 use crate::picture::{Picture, write_png};
-use crate::player::{self, Course};
 use crate::render::{self, FrameStats, Look, Offscreen, RenderError};
 use crate::surface::Surface;
 use crate::terrain::{FrameView, Stats, Terrain, TerrainError};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::message::{Layer, Scene};
-use glam::{DVec2, DVec3};
-use serde::{Deserialize, Serialize};
+use glam::DVec3;
+use serde::Serialize;
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// Most key frames of a path.
-const KEYS_MAX: usize = 100_000;
-
-/// The longest flight at random, in seconds: a day.
-pub const RANDOM_SECONDS_MAX: f64 = 86_400.0;
-
-/// Seconds between its keys.
-const RANDOM_STEP: f64 = 5.0;
-
-/// The largest file with a path, in bytes.
-const PATH_BYTES_MAX: u64 = 64 << 20;
+mod fly;
+mod path;
 
 pub use crate::overview::{extent, overview, stretched_overview};
+pub use fly::{Flight, FrameLine, Play, fly};
+pub(crate) use path::Dice;
+pub use path::{FlightPath, PathKey, RANDOM_SECONDS_MAX};
 
 /// Why there is no picture or flight.
 #[derive(Debug, thiserror::Error)]
@@ -353,391 +346,6 @@ fn write(picture: &Picture, path: &Path) -> std::io::Result<()> {
     out.flush()
 }
 
-/// A path through a scene: eyes and targets at moments.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct FlightPath {
-    /// Moments, in rising order.
-    pub keys: Vec<PathKey>,
-}
-
-/// The camera at a moment.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct PathKey {
-    /// Seconds from the start.
-    pub seconds: f64,
-    /// The eye, in the frame's metres.
-    pub eye: [f64; 3],
-    /// What the camera looks at.
-    pub target: [f64; 3],
-}
-
-impl FlightPath {
-    /// Reads a path from a JSON file.
-    ///
-    /// # Errors
-    /// When the file cannot be read or holds no path.
-    pub fn read(path: &Path) -> Result<Self, HeadlessError> {
-        let wrong = |what: String| HeadlessError::Path { path: path.to_owned(), what };
-        let bytes = std::fs::metadata(path).map_err(file_error("read", path))?.len();
-        if bytes > PATH_BYTES_MAX {
-            return Err(wrong(format!("{bytes} bytes, limit {PATH_BYTES_MAX}")));
-        }
-        let text = std::fs::read(path).map_err(file_error("read", path))?;
-        let flight: Self = serde_json::from_slice(&text).map_err(|e| wrong(e.to_string()))?;
-        if flight.keys.is_empty() || flight.keys.len() > KEYS_MAX {
-            return Err(wrong(format!("{} keys, expected 1 to {KEYS_MAX}", flight.keys.len())));
-        }
-        if !flight.keys.is_sorted_by(|a, b| a.seconds < b.seconds) {
-            return Err(wrong("its seconds do not rise".to_owned()));
-        }
-        if flight.keys.iter().any(|k| k.eye == k.target) {
-            return Err(wrong("an eye is its own target".to_owned()));
-        }
-        Ok(flight)
-    }
-
-    /// A round over a scene: in from the overview, across it low, and out.
-    #[must_use]
-    pub fn round(scene: &Scene) -> Self {
-        let [low, high] = extent(scene);
-        let centre = (low + high) / 2.0;
-        let span = high - low;
-        let far = overview(scene, [16, 9]);
-        let keys = (0..=12).map(|i| {
-            let part = f64::from(i) / 12.0;
-            let angle = part * std::f64::consts::TAU - std::f64::consts::FRAC_PI_2;
-            // 0 at both ends, 1 in the middle: how far in.
-            let near = (part * std::f64::consts::PI).sin();
-            let around = DVec3::new(angle.cos() * span.x, angle.sin() * span.y, 0.0) * (0.9 - 0.65 * near);
-            let height = high.z + (far.eye.z - high.z) * (1.0 - near) + span.truncate().length() * 0.03;
-            let eye = if i % 12 == 0 { far.eye } else { (centre + around).with_z(height) };
-            PathKey {
-                seconds: f64::from(i) * 1.0,
-                eye: eye.to_array(),
-                target: centre.with_z(low.z).to_array(),
-            }
-        });
-        Self { keys: keys.collect() }
-    }
-
-    /// A flight at random, the same for the same seed: from place to place, low over the ground and high above it, with a key
-    /// every five seconds. At most [`RANDOM_SECONDS_MAX`].
-    #[must_use]
-    pub fn random(scene: &Scene, seed: u64, seconds: f64) -> Self {
-        let [low, high] = extent(scene);
-        let span = (high - low).truncate();
-        let mut dice = Dice(seed);
-        let seconds = seconds.clamp(1e-3, RANDOM_SECONDS_MAX);
-        let count = (seconds / RANDOM_STEP).ceil().max(1.0);
-        let mut place = low.truncate() + span * DVec2::new(dice.roll(), dice.roll());
-        #[allow(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            reason = "at most some ten thousand"
-        )]
-        let keys = (0..=count as u32).map(|i| {
-            // Mostly on to somewhere near, now and then far away.
-            let reach = if dice.roll() < 0.15 { 0.6 } else { 0.08 };
-            let step = span * reach * (DVec2::new(dice.roll(), dice.roll()) - 0.5);
-            place = (place + step).clamp(low.truncate(), high.truncate());
-            // From a two-hundredth to a third of the scene's size above its highest ground.
-            let above = span.max_element() * 0.005 * 66f64.powf(dice.roll());
-            let ahead =
-                DVec2::from_angle(std::f64::consts::TAU * dice.roll()) * above * (1.0 + 3.0 * dice.roll());
-            let (eye, target) =
-                (place.extend(high.z + above), (place + ahead).extend(low.z.midpoint(high.z)));
-            let at = f64::from(i) / count * seconds;
-            PathKey { seconds: at, eye: eye.to_array(), target: target.to_array() }
-        });
-        Self { keys: keys.collect() }
-    }
-
-    /// Seconds from the first key to the last.
-    #[must_use]
-    pub fn seconds(&self) -> f64 {
-        match (self.keys.first(), self.keys.last()) {
-            (Some(first), Some(last)) => last.seconds - first.seconds,
-            _ => 0.0,
-        }
-    }
-
-    /// The camera at a part (0 to 1) of the path, on a smooth curve through its keys (Catmull and Rom
-    /// 1974).
-    #[must_use]
-    pub fn camera(&self, part: f64, size: [u32; 2]) -> Camera {
-        let keys = &self.keys;
-        let at = |i: usize| keys[i.min(keys.len() - 1)];
-        let seconds = at(0).seconds + self.seconds() * part.clamp(0.0, 1.0);
-        let i = keys.partition_point(|k| k.seconds <= seconds).saturating_sub(1);
-        let (p1, p2) = (at(i), at(i + 1));
-        let (p0, p3) = (at(i.saturating_sub(1)), at(i + 2));
-        let length = p2.seconds - p1.seconds;
-        let t = if length > 0.0 { (seconds - p1.seconds) / length } else { 0.0 };
-        let curve = |f: fn(&PathKey) -> [f64; 3]| {
-            let [a, b, c, d] = [p0, p1, p2, p3].map(|k| DVec3::from_array(f(&k)));
-            let (t2, t3) = (t * t, t * t * t);
-            0.5 * (2.0 * b
-                + (c - a) * t
-                + (2.0 * a - 5.0 * b + 4.0 * c - d) * t2
-                + (3.0 * b - a - 3.0 * c + d) * t3)
-        };
-        Camera { eye: curve(|k| k.eye), target: curve(|k| k.target), fov_y: FOV_Y, size }
-    }
-}
-
-/// Numbers that look random, the same from the same beginning (splitmix64).
-pub(crate) struct Dice(pub(crate) u64);
-
-impl Dice {
-    /// From 0 to below 1.
-    pub(crate) fn roll(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut v = self.0;
-        v = (v ^ v >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        v = (v ^ v >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((v ^ v >> 31) >> 11) as f64 / (1u64 << 53) as f64
-    }
-}
-
-/// How water that changes with time goes on while a path is flown.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Play {
-    /// Seconds of it for a second of the path; below 0: backwards; 0: it stands.
-    pub speed: f64,
-    /// Whether it begins again after the last step.
-    pub is_round: bool,
-}
-
-/// How to fly.
-#[derive(Debug, Clone)]
-pub struct Flight {
-    /// How water that changes with time goes on, from the terrain's time.
-    pub play: Play,
-    /// Frames to draw.
-    pub frames: u32,
-    /// Frames a second at most; 0: as fast as they can be drawn.
-    pub frames_a_second: f64,
-    /// Width and height, in pixels.
-    pub size: [u32; 2],
-    /// A folder for a PNG of each frame.
-    pub pictures: Option<PathBuf>,
-    /// Whether pictures come back from the graphics adapter even where they are not written; else each frame waits until
-    /// it is drawn.
-    pub reads: bool,
-    /// Let each frame wait up to so long for data, so that what a flight takes follows from its path alone.
-    pub patience: Option<Duration>,
-}
-
-/// One frame of a flight: a line of the CSV.
-#[derive(Debug, Clone, Serialize)]
-pub struct FrameLine {
-    /// From 0.
-    pub frame: u32,
-    /// Seconds since the start.
-    pub seconds: f64,
-    /// Milliseconds to choose the cut and take what has arrived.
-    pub cut_ms: f64,
-    /// Milliseconds to upload and draw, until the picture is there; and to read it back, where pictures are.
-    pub draw_ms: f64,
-    /// The largest error of what is drawn, in pixels, as in [`PictureReport`]; `inf` until all roots are there.
-    pub error_pixels: f64,
-    /// The error of the ideal cut.
-    pub goal_pixels: f64,
-    /// Whether all that the ideal cut wants is there.
-    pub complete: bool,
-    /// Diamonds in motion.
-    pub moving: usize,
-    /// Diamonds drawn.
-    pub diamonds: usize,
-    /// Triangles drawn.
-    pub triangles: u64,
-    /// Draw calls.
-    pub draws: u32,
-    /// Bytes uploaded to the GPU for this frame.
-    pub uploaded_bytes: u64,
-    /// Bytes of surfaces on the GPU.
-    pub gpu_bytes: u64,
-    /// Diamonds resident.
-    pub resident: usize,
-    /// Bytes of memory that they take.
-    pub resident_bytes: usize,
-    /// Bytes received so far.
-    pub bytes: u64,
-    /// Requests sent so far.
-    pub requests: u64,
-    /// Round trips so far.
-    pub round_trips: u64,
-    /// Real points received so far.
-    pub real_points: u64,
-    /// Fictitious points deduced so far.
-    pub fictitious_points: u64,
-    /// Whether the eye was in the zone that was asked for: see [`PictureReport::zone_in_effect`].
-    pub zone_in_effect: bool,
-    /// Bytes of GPU memory besides those of surfaces: see [`FrameStats::fixed_bytes`].
-    pub gpu_fixed_bytes: u64,
-    /// Bytes so far that were fetched before, and came from the disk.
-    pub disk_bytes: u64,
-    /// Whether the server was not asked.
-    pub offline: bool,
-    /// Whether memory, here or on the GPU, kept the ideal cut from the asked error.
-    pub limited_by_memory: bool,
-    /// The time of water that changes with it, in seconds.
-    pub time_seconds: f64,
-    /// Series of which an earlier step was drawn, since that of this time had not arrived.
-    pub late: usize,
-    /// Steps of series that come next and were there already.
-    pub steps_ahead: usize,
-}
-
-impl FrameLine {
-    /// The heading of the CSV.
-    pub const HEADING: &str = "frame,seconds,cut_ms,draw_ms,error_pixels,goal_pixels,complete,moving,diamonds,triangles,draws,uploaded_bytes,gpu_bytes,resident,resident_bytes,bytes,requests,round_trips,real_points,fictitious_points,zone_in_effect,gpu_fixed_bytes,disk_bytes,offline,limited_by_memory,time_seconds,late,steps_ahead";
-
-    /// The line, with the fields of the heading.
-    #[must_use]
-    pub fn csv(&self) -> String {
-        format!(
-            "{},{:.4},{:.3},{:.3},{:.4},{:.4},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{:.4},{},{}",
-            self.frame,
-            self.seconds,
-            self.cut_ms,
-            self.draw_ms,
-            self.error_pixels,
-            self.goal_pixels,
-            self.complete,
-            self.moving,
-            self.diamonds,
-            self.triangles,
-            self.draws,
-            self.uploaded_bytes,
-            self.gpu_bytes,
-            self.resident,
-            self.resident_bytes,
-            self.bytes,
-            self.requests,
-            self.round_trips,
-            self.real_points,
-            self.fictitious_points,
-            self.zone_in_effect,
-            self.gpu_fixed_bytes,
-            self.disk_bytes,
-            self.offline,
-            self.limited_by_memory,
-            self.time_seconds,
-            self.late,
-            self.steps_ahead,
-        )
-    }
-}
-
-/// Flies along a path while data stream in. Unless told to, no frame waits for them: each draws what is there. `each` sees
-/// every frame's line and picture as soon as it is drawn. Motions take the path's time, not the wall's: so a flight
-/// looks the same however long its frames take.
-///
-/// # Errors
-/// When there is no graphics adapter, a picture cannot be written, or `each` says so.
-pub fn fly(
-    terrain: &mut Terrain,
-    path: &FlightPath,
-    flight: &Flight,
-    look: &Look,
-    options: &render::Options,
-    mut each: impl FnMut(&FrameLine, Option<&Picture>) -> Result<(), HeadlessError>,
-) -> Result<(), HeadlessError> {
-    let mut offscreen = Offscreen::new(options)?;
-    terrain.suit_blocks(offscreen.reads_blocks());
-    terrain.set_exaggeration(look.exaggeration);
-    // Of a version of the scene.
-    let mut annotator: Option<(String, Annotator)> = None;
-    terrain.set_wires(look.wireframe);
-    terrain.set_mirrors(look.mirrors().then_some(look.water.mirror_error));
-    let (play, from) = (flight.play, terrain.time());
-    let is_playing = play.speed != 0.0;
-    let course = is_playing.then_some(Course { is_backward: play.speed < 0.0, is_round: play.is_round });
-    let started = Instant::now();
-    for frame in 0..flight.frames {
-        if flight.frames_a_second > 0.0 {
-            let due = Duration::from_secs_f64(f64::from(frame) / flight.frames_a_second);
-            std::thread::sleep(due.saturating_sub(started.elapsed()));
-        }
-        let part = f64::from(frame) / f64::from((flight.frames - 1).max(1));
-        let camera = path.camera(part, flight.size);
-        let clock = Instant::now();
-        let drawn = stretched(&camera, look.exaggeration);
-        let seconds = part * path.seconds();
-        if is_playing {
-            // It follows the path and waits for nothing: flights can be compared.
-            let time = player::time_at(&terrain.scene().series, from, seconds, play.speed, play.is_round);
-            terrain.set_time(time, course);
-        }
-        if let Some(patience) = flight.patience {
-            terrain.settle_at(&drawn, seconds, patience);
-        }
-        let clock = flight.patience.map_or(clock, |_| Instant::now());
-        let view = terrain.frame_at(&drawn, seconds);
-        let cut_ms = clock.elapsed().as_secs_f64() * 1e3;
-        let clock = Instant::now();
-        // Waves move in the path's time, too.
-        let mut look = *look;
-        look.water.seconds += seconds;
-        // Of this frame's version: another may have taken over, and lie elsewhere.
-        offscreen.drape(view.drape.as_ref());
-        offscreen.mirror(&view.mirrors);
-        let stats = offscreen.draw(&terrain.scene().layers, &drawn, &view.items, &look)?;
-        if look.annotations.is_any() {
-            let version = &terrain.scene().version;
-            let kept = annotator.take().filter(|(of, _)| of == version);
-            let (_, annotator) =
-                annotator.insert(kept.unwrap_or_else(|| (version.clone(), Annotator::new(terrain.scene()))));
-            annotator.annotate(&mut offscreen, terrain, &drawn, &view.items, &look);
-        }
-        let picture = if flight.reads || flight.pictures.is_some() {
-            Some(offscreen.read()?)
-        } else {
-            offscreen.wait()?;
-            None
-        };
-        let draw_ms = clock.elapsed().as_secs_f64() * 1e3;
-        let line = FrameLine {
-            frame,
-            seconds: started.elapsed().as_secs_f64(),
-            cut_ms,
-            draw_ms,
-            error_pixels: view.error_pixels,
-            goal_pixels: view.error_pixels_goal,
-            complete: view.complete,
-            moving: view.moving,
-            diamonds: view.items.len(),
-            triangles: stats.triangles,
-            draws: stats.draws,
-            uploaded_bytes: stats.uploaded_bytes,
-            gpu_bytes: stats.gpu_bytes,
-            resident: view.stats.resident,
-            resident_bytes: view.stats.resident_bytes,
-            bytes: view.stats.traffic.bytes,
-            requests: view.stats.traffic.requests,
-            round_trips: view.stats.traffic.round_trips,
-            real_points: view.stats.points_real,
-            fictitious_points: view.stats.points_fictitious,
-            zone_in_effect: view.stats.zone_in_effect,
-            gpu_fixed_bytes: stats.fixed_bytes,
-            disk_bytes: view.stats.traffic.disk_bytes,
-            offline: view.stats.offline,
-            limited_by_memory: view.limited,
-            time_seconds: terrain.time(),
-            late: view.late,
-            steps_ahead: view.stats.steps_ahead,
-        };
-        if let (Some(folder), Some(picture)) = (&flight.pictures, &picture) {
-            save(picture, &folder.join(format!("frame-{frame:05}.png")))?;
-        }
-        each(&line, picture.as_ref())?;
-    }
-    Ok(())
-}
-
 /// Writes lines of text to a file, or to standard output if it is named `-`.
 ///
 /// # Errors
@@ -754,10 +362,6 @@ pub fn open_text(path: &Path) -> Result<Box<dyn Write>, HeadlessError> {
 mod tests {
     use super::*;
 
-    fn key(seconds: f64, x: f64) -> PathKey {
-        PathKey { seconds, eye: [x, 0.0, 100.0], target: [x, 500.0, 0.0] }
-    }
-
     #[test]
     fn a_picture_is_written_whole_or_not_at_all() {
         let folder = tempfile::tempdir().unwrap();
@@ -771,75 +375,5 @@ mod tests {
         assert_eq!(std::fs::read(&path).unwrap(), before, "the old one stays");
         let full = save(&picture, Path::new("/dev/full")).unwrap_err().to_string();
         assert!(full.contains("/dev/full") && full.contains("write the picture"), "{full}");
-    }
-
-    #[test]
-    fn a_path_passes_through_its_keys() {
-        let path = FlightPath { keys: vec![key(0.0, 0.0), key(1.0, 10.0), key(4.0, 5.0)] };
-        for (part, x) in [(0.0, 0.0), (0.25, 10.0), (1.0, 5.0), (2.0, 5.0)] {
-            assert!((path.camera(part, [4, 3]).eye.x - x).abs() < 1e-9, "{part}");
-        }
-        let lone = FlightPath { keys: vec![key(3.0, 7.0)] };
-        assert_eq!(lone.camera(0.5, [4, 3]).eye.x, 7.0);
-    }
-
-    #[test]
-    fn a_path_that_makes_no_sense_is_refused_with_its_name() {
-        let folder = std::env::temp_dir().join(format!("diamantina-paths-{}", std::process::id()));
-        std::fs::create_dir_all(&folder).unwrap();
-        for (text, word) in [
-            ("", "EOF"),
-            ("{\"keys\": []}", "0 keys"),
-            (
-                "{\"keys\": [{\"seconds\":1,\"eye\":[0,0,1],\"target\":[0,0,0]},{\"seconds\":1,\"eye\":[0,0,1],\"target\":[0,0,0]}]}",
-                "rise",
-            ),
-            ("{\"keys\": [{\"seconds\":1,\"eye\":[0,0,0],\"target\":[0,0,0]}]}", "its own target"),
-        ] {
-            let path = folder.join("path.json");
-            std::fs::write(&path, text).unwrap();
-            let message = FlightPath::read(&path).unwrap_err().to_string();
-            assert!(message.contains("path.json") && message.contains(word), "{message}");
-        }
-        std::fs::remove_dir_all(&folder).unwrap();
-    }
-
-    #[test]
-    fn the_csv_has_as_many_fields_as_its_heading() {
-        let line = FrameLine {
-            frame: 1,
-            seconds: 2.0,
-            cut_ms: 3.0,
-            draw_ms: 4.0,
-            error_pixels: f64::INFINITY,
-            goal_pixels: 0.5,
-            complete: false,
-            moving: 0,
-            diamonds: 1,
-            triangles: 2,
-            draws: 3,
-            uploaded_bytes: 4,
-            gpu_bytes: 5,
-            resident: 6,
-            resident_bytes: 7,
-            bytes: 8,
-            requests: 9,
-            round_trips: 10,
-            real_points: 11,
-            fictitious_points: 12,
-            zone_in_effect: true,
-            gpu_fixed_bytes: 13,
-            disk_bytes: 14,
-            offline: false,
-            limited_by_memory: true,
-            time_seconds: 14.5,
-            late: 1,
-            steps_ahead: 2,
-        };
-        assert_eq!(line.csv().split(',').count(), FrameLine::HEADING.split(',').count());
-        let json = serde_json::to_value(&line).unwrap();
-        for name in FrameLine::HEADING.split(',') {
-            assert!(json.get(name).is_some(), "{name}");
-        }
     }
 }

@@ -17,7 +17,7 @@ pub enum Coding {
 }
 
 impl Coding {
-    /// The better one of those that are asked for and that there are.
+    /// Blocks where they are wanted and can be made.
     #[must_use]
     pub fn blocks_if(wanted: bool) -> Self {
         if wanted && cfg!(not(target_arch = "wasm32")) { Self::Blocks } else { Self::Plain }
