@@ -2,7 +2,7 @@
 //!
 //! | what | of the memory | at most |
 //! |---|---|---|
-//! | surfaces that the cut wants | 3/4 | |
+//! | surfaces that the cut wants; a quarter of it is for what water mirrors, where any does | 3/4 | |
 //! | surfaces, those included | 27/32 | |
 //! | payloads that are wished for or wait for their parents | 1/32 | 16 MiB, some 20 000 typical payloads |
 //! | decoded surfaces that wait for a frame | 1/32 | 256, 25 MB for n = 64 |
