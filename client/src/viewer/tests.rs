@@ -433,6 +433,11 @@ fn texts(hand: &mut Hand, with_panel: bool) -> Vec<(String, Pos2)> {
     };
     let viewer = &mut hand.viewer;
     let output = hand.context.run_ui(input, |ui| viewer.frame_of(ui, with_panel));
+    texts_of(output)
+}
+
+/// The texts of a frame, and where they begin.
+fn texts_of(output: egui::FullOutput) -> Vec<(String, Pos2)> {
     let texts = output.shapes.iter().filter_map(|s| match &s.shape {
         egui::Shape::Text(text) => Some((text.galley.text().to_owned(), text.pos)),
         _ => None,
@@ -520,13 +525,7 @@ fn the_panel_has_a_clock_where_water_changes_with_time_and_nowhere_else() {
         let input = RawInput { screen_rect, time, events, focused: true, ..RawInput::default() };
         let viewer = &mut hand.viewer;
         let output = hand.context.run_ui(input, |ui| time::show(viewer, ui));
-        let texts = output.shapes.iter().filter_map(|s| match &s.shape {
-            egui::Shape::Text(text) => Some((text.galley.text().to_owned(), text.pos)),
-            _ => None,
-        });
-        let texts = texts.collect();
-        output.drop_without_applying_deltas();
-        texts
+        texts_of(output)
     };
     let press = |hand: &mut Hand, text: &str| {
         let pos = find(&clock(hand, &[]), text).unwrap() + vec2(4.0, 6.0);
