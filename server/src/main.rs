@@ -558,6 +558,7 @@ fn experiment(args: &ExperimentArgs, given: &clap::ArgMatches) -> Result<(), Fai
     experiment::refuse_ignored(&args.name, given).map_err(|e| Failure(2, e.to_string()))?;
     let progress = Arc::new(Progress::new());
     stop_on_signals(&progress)?;
+    experiment::report::prepare(&args.output)?;
     let found = experiment::run(&args.name, &args.sources, &args.ingest, &args.options, &progress);
     progress.finish();
     let report = found.map_err(|e| {

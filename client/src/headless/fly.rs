@@ -82,9 +82,9 @@ pub struct FrameLine {
     pub real_points: u64,
     /// Fictitious points deduced so far.
     pub fictitious_points: u64,
-    /// Whether the eye was in the zone that was asked for: see [`PictureReport::zone_in_effect`].
+    /// Whether the eye was in the zone that was asked for: see [`super::PictureReport::zone_in_effect`].
     pub zone_in_effect: bool,
-    /// Bytes of GPU memory besides those of surfaces: see [`FrameStats::fixed_bytes`].
+    /// Bytes of GPU memory besides those of surfaces: see [`crate::render::FrameStats::fixed_bytes`].
     pub gpu_fixed_bytes: u64,
     /// Bytes so far that were fetched before, and came from the disk.
     pub disk_bytes: u64,

@@ -311,6 +311,58 @@ impl Bitree {
         ControlFlow::Continue(())
     }
 
+    /// The same, were the middle of a split triangle not real: what removing it would leave.
+    pub fn leaves_without_middle(
+        &self,
+        from: &Facet,
+        visit: &mut impl FnMut(&Facet) -> ControlFlow<()>,
+    ) -> ControlFlow<()> {
+        let is_last = self.below.get(from.path as usize).is_none_or(|count| *count <= 1);
+        if is_last {
+            return visit(from);
+        }
+        let [ha, hc, hb] = from.heights;
+        let hm = (ha + hb) / 2.0;
+        for (mut half, heights) in self.halves(from).into_iter().zip([[hc, hm, ha], [hb, hm, hc]]) {
+            half.heights = heights;
+            self.leaves(&half, visit)?;
+        }
+        ControlFlow::Continue(())
+    }
+
+    /// The ends of the hypotenuse in whose middle a point stands; `None` for the corners and outside of the grid.
+    #[must_use]
+    pub fn hypotenuse(&self, point: Point) -> Option<[Point; 2]> {
+        self.level(point).filter(|level| *level > 0)?;
+        let [x, y] = point;
+        let zeros = (x | y).trailing_zeros();
+        let step = 1u32 << zeros;
+        let is_odd = |w: u32| w >> zeros & 1 == 1;
+        Some(match (is_odd(x), is_odd(y)) {
+            (true, false) => [[x - step, y], [x + step, y]],
+            (false, _) => [[x, y - step], [x, y + step]],
+            // Diagonals of neighbouring squares meet in the centres of those twice as large.
+            (true, true) if (x >> (zeros + 1) ^ y >> (zeros + 1)) & 1 == 0 => {
+                [[x - step, y - step], [x + step, y + step]]
+            }
+            (true, true) => [[x - step, y + step], [x + step, y - step]],
+        })
+    }
+
+    /// How high the surface is at a point where nothing is real but what is above it: the mean of the ends of its
+    /// hypotenuse. `None` as of [`Self::hypotenuse`].
+    #[must_use]
+    pub fn height_without(&self, point: Point) -> Option<f64> {
+        let [a, b] = self.hypotenuse(point)?.map(|end| self.real[self.slot(end)]);
+        let mean = (a + b) / 2.0;
+        if !mean.is_nan() {
+            return Some(mean);
+        }
+        // An end is fictitious itself.
+        let [ha, _, hb] = self.around(point).into_iter().flatten().next()?.heights;
+        Some((ha + hb) / 2.0)
+    }
+
     /// The height of a real point.
     #[must_use]
     pub fn real(&self, point: Point) -> Option<f64> {
@@ -336,10 +388,7 @@ impl Bitree {
         match self.presence(point) {
             Presence::Absent => None,
             Presence::Real => self.real(point),
-            Presence::Fictitious => {
-                let [ha, _, hb] = self.around(point).into_iter().flatten().next()?.heights;
-                Some((ha + hb) / 2.0)
-            }
+            Presence::Fictitious => self.height_without(point),
         }
     }
 }
@@ -448,6 +497,50 @@ mod tests {
         assert_eq!(bitree.presence([0, 4]), Presence::Fictitious);
         assert_eq!(bitree.presence([4, 0]), Presence::Absent, "a restricted quadtree would need it");
         assert_eq!(bitree.presence([1, 2]), Presence::Real);
+    }
+
+    #[test]
+    fn hypotenuses_are_those_of_the_triangles_around() {
+        let mut bitree = flat(4);
+        for (point, height) in [([8, 8], 3.0), ([4, 12], -7.0), ([5, 0], 11.0), ([16, 8], 6.0)] {
+            bitree.add(point, height);
+        }
+        for point in (0..=16).flat_map(|y| (0..=16).map(move |x| [x, y])) {
+            let facets: Vec<Facet> = bitree.around(point).into_iter().flatten().collect();
+            assert_eq!(bitree.hypotenuse(point).is_some(), !facets.is_empty(), "{point:?}");
+            for facet in facets {
+                let ([a, _, b], [ha, _, hb]) = (facet.corners(), facet.heights());
+                let ends = bitree.hypotenuse(point).unwrap();
+                assert!(ends == [a, b] || ends == [b, a], "{point:?}: {ends:?}");
+                assert_eq!(bitree.height_without(point), Some((ha + hb) / 2.0), "{point:?}");
+            }
+        }
+        assert_eq!(bitree.hypotenuse([17, 3]), None);
+    }
+
+    #[test]
+    fn what_removing_leaves_is_told_beforehand() {
+        let mut bitree = flat(3);
+        for (point, height) in [([4, 4], 3.0), ([1, 2], -7.0), ([5, 0], 11.0), ([8, 4], 6.0), ([6, 2], 1.0)] {
+            bitree.add(point, height);
+        }
+        for point in [[4, 4], [1, 2], [5, 0], [8, 4], [6, 2]] {
+            let mut removed = bitree.clone();
+            removed.remove(point);
+            for (before, after) in bitree.around(point).into_iter().zip(removed.around(point)) {
+                let [mut told, mut found] = [Vec::new(), Vec::new()];
+                let (Some(before), Some(after)) = (before, after) else { continue };
+                let _ = bitree.leaves_without_middle(&before, &mut |facet| {
+                    told.push(*facet);
+                    ControlFlow::Continue(())
+                });
+                let _ = removed.leaves(&after, &mut |facet| {
+                    found.push(*facet);
+                    ControlFlow::Continue(())
+                });
+                assert_eq!(told, found, "{point:?}");
+            }
+        }
     }
 
     #[test]

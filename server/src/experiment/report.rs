@@ -1,7 +1,7 @@
 //! What an experiment hands in: tables and pictures, written as CSV, SVG or PNG, one HTML page and JSON.
 
 use super::ExperimentError;
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 use std::fmt::Write as _;
 use std::path::Path;
 
@@ -14,7 +14,8 @@ pub struct Table {
     pub caption: String,
     /// Headings with units.
     pub columns: Vec<String>,
-    /// Cells as they are written.
+    /// Cells as they are written; numbers in JSON where they are such.
+    #[serde(serialize_with = "numbers")]
     pub rows: Vec<Vec<String>>,
 }
 
@@ -45,6 +46,15 @@ impl Table {
     }
 }
 
+/// Cells with units, spreads or words stay text.
+fn numbers<S: Serializer>(rows: &[Vec<String>], serializer: S) -> Result<S::Ok, S::Error> {
+    let value = |cell: &String| match cell.parse::<serde_json::Number>() {
+        Ok(number) => serde_json::Value::Number(number),
+        Err(_) => serde_json::Value::String(cell.clone()),
+    };
+    serializer.collect_seq(rows.iter().map(|row| row.iter().map(value).collect::<Vec<_>>()))
+}
+
 /// A picture as its file.
 #[derive(Debug, Serialize)]
 pub struct Picture {
@@ -55,6 +65,15 @@ pub struct Picture {
     /// The file.
     #[serde(skip)]
     pub bytes: Vec<u8>,
+}
+
+/// Makes a folder, if need be, and sees whether files can be made in it: before work whose results it is to hold.
+///
+/// # Errors
+/// When they cannot.
+pub fn prepare(folder: &Path) -> Result<(), ExperimentError> {
+    let made = std::fs::create_dir_all(folder).and_then(|()| tempfile::tempfile_in(folder));
+    made.map(drop).map_err(|source| ExperimentError::Write { path: folder.to_owned(), source })
 }
 
 /// All that an experiment found.
@@ -80,8 +99,7 @@ impl Report {
             let path = folder.join(name);
             std::fs::write(&path, bytes).map_err(|source| ExperimentError::Write { path, source })
         };
-        std::fs::create_dir_all(folder)
-            .map_err(|source| ExperimentError::Write { path: folder.to_owned(), source })?;
+        prepare(folder)?;
         for table in &self.tables {
             save(&format!("{}.csv", table.name), table.csv().as_bytes())?;
         }
@@ -163,6 +181,8 @@ mod tests {
         let mut table = Table::new("t", "a <b>", &["x, y", "z"]);
         table.push(["1".to_owned(), "say \"so\"".to_owned()]);
         assert_eq!(table.csv(), "\"x, y\",z\n1,\"say \"\"so\"\"\"\n");
+        let json = serde_json::to_value(&table).unwrap();
+        assert_eq!(json["rows"], serde_json::json!([[1, "say \"so\""]]));
         let report =
             Report { title: "a & b".to_owned(), notes: vec![], tables: vec![table], pictures: vec![] };
         assert!(report.html().contains("a &amp; b") && report.html().contains("a &lt;b&gt;"));

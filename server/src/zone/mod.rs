@@ -31,6 +31,7 @@ use crate::progress::Progress;
 use crate::store::zones::Zones;
 use crate::store::{Store, StoreError, compress};
 use cast::{BEND, Eye, Optics};
+use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::message::{Kind, Layer, Scene, is_name};
 use diamantina_protocol::zone::{self, LAYERS_MAX, Mask, Part, ZONES_MAX, Zone, pack};
@@ -214,13 +215,13 @@ pub struct Report {
     pub spacing: f64,
     /// Azimuths that were looked at, over all eyes.
     pub azimuths: u64,
-    /// Samples of the layers.
+    /// Samples of the terrain that have data.
     pub samples: u64,
     /// Samples that are seen, or by their angle as good as seen.
     pub samples_seen: u64,
     /// Samples that are hidden.
     pub samples_hidden: u64,
-    /// Diamonds of the finest level told.
+    /// Diamonds of the terrain's finest level that have data.
     pub diamonds: u64,
     /// Those of them that are hidden.
     pub diamonds_hidden: u64,
@@ -264,22 +265,29 @@ pub fn add(root: &Path, options: &Options, progress: &Progress) -> Result<Report
     let mut masks = Vec::with_capacity(grounds.len());
     progress.stage("zone", "eyes", (eyes.len() * grounds.len()) as u64, 0);
     let mut grounds = grounds.iter();
+    let floor = pack(options.hidden);
     for layer in &scene.layers {
         let ground = if is_step(scene, layer) { None } else { grounds.next() };
-        let shares = match (layer.kind, ground) {
+        let (shares, relief) = match (layer.kind, ground) {
             (Kind::Terrain, Some(ground)) => {
                 tally.azimuths +=
                     eyes.iter().map(|(p, z)| azimuths(ground, ground.eye(*p, *z), options)).sum::<u64>();
-                shares(ground, &polygons, &eyes, options, progress).ok_or(ZoneError::Interrupted)?
+                let shares = shares(ground, &polygons, &eyes, options, progress);
+                (shares.ok_or(ZoneError::Interrupted)?, Some(&ground.relief))
             }
             // Water is seen through, so it hides nothing, itself included; and what ground hides of it is not looked at.
             _ => {
                 progress.advance(if ground.is_some() { eyes.len() as u64 } else { 0 });
-                Tiled::filled(layer.samples.map(|side| side as usize), u8::MAX)
+                (Tiled::filled(layer.samples.map(|side| side as usize), u8::MAX), None)
             }
         };
-        tally.count(&shares, pack(options.hidden));
-        masks.push(mask(layer, &shares, pack(options.hidden), scene.layers.len()));
+        let finest = finest_shares(layer, &shares, relief, floor);
+        if let Some(relief) = relief {
+            tally.samples(&shares, relief, floor);
+            tally.diamonds(&finest, floor);
+        }
+        let finest = finest.into_iter().map(|share| share.unwrap_or(floor)).collect();
+        masks.push(Mask::saturated(layer.forest, floor, scene.layers.len(), finest));
     }
     progress.finish();
     let seconds_casting = started.elapsed().as_secs_f64() - seconds_reading;
@@ -302,7 +310,6 @@ pub fn add(root: &Path, options: &Options, progress: &Progress) -> Result<Report
     all.push((zone.clone(), blob.into()));
     all.sort_by(|(a, _), (b, _)| a.name.cmp(&b.name));
     let published = zones.publish(&all)?;
-    let finest = |mask: &Mask| mask.tally(mask.levels() - 1);
     Ok(Report {
         scene: scene.name.clone(),
         version: published.version,
@@ -313,10 +320,10 @@ pub fn add(root: &Path, options: &Options, progress: &Progress) -> Result<Report
         spacing,
         azimuths: tally.azimuths,
         samples: tally.samples,
-        samples_seen: tally.seen,
-        samples_hidden: tally.hidden,
-        diamonds: masks.iter().map(|mask| finest(mask)[0]).sum(),
-        diamonds_hidden: masks.iter().map(|mask| finest(mask)[1]).sum(),
+        samples_seen: tally.samples_seen,
+        samples_hidden: tally.samples_hidden,
+        diamonds: tally.diamonds,
+        diamonds_hidden: tally.diamonds_hidden,
         mask_bytes: bytes.len() as u64,
         seconds_reading,
         seconds_casting,
@@ -537,33 +544,50 @@ pub fn shares(
     Some(shares)
 }
 
+/// What has data, and how much of it is seen.
 #[derive(Default)]
 struct Tally {
     azimuths: u64,
     samples: u64,
-    seen: u64,
-    hidden: u64,
+    samples_seen: u64,
+    samples_hidden: u64,
+    diamonds: u64,
+    diamonds_hidden: u64,
 }
 
 impl Tally {
-    fn count(&mut self, shares: &Tiled<u8>, floor: u8) {
-        for share in shares.rows() {
+    fn samples(&mut self, shares: &Tiled<u8>, relief: &Relief, floor: u8) {
+        let [width, height] = relief.size();
+        let places = (0..height).flat_map(|y| (0..width).map(move |x| [x, y]));
+        for at in places.filter(|at| relief.at(*at) != NODATA) {
+            let share = shares.at(at);
             self.samples += 1;
-            self.seen += u64::from(share == u8::MAX);
-            self.hidden += u64::from(share == floor);
+            self.samples_seen += u64::from(share == u8::MAX);
+            self.samples_hidden += u64::from(share == floor);
         }
+    }
+
+    fn diamonds(&mut self, finest: &[Option<u8>], floor: u8) {
+        self.diamonds += finest.iter().flatten().count() as u64;
+        self.diamonds_hidden += finest.iter().flatten().filter(|share| **share == floor).count() as u64;
     }
 }
 
-/// The visibility of each diamond: the largest of its samples, borders included.
-fn mask(layer: &Layer, shares: &Tiled<u8>, floor: u8, layers: usize) -> Mask {
+/// The visibility of each diamond of the finest level: the largest of its samples, borders included; `None` where none
+/// has data. Of a layer without relief nothing is known, and all of it is as visible as its shares say.
+fn finest_shares(
+    layer: &Layer,
+    shares: &Tiled<u8>,
+    relief: Option<&Relief>,
+    floor: u8,
+) -> Vec<Option<u8>> {
     let forest = &layer.forest;
     let level = forest.levels() - 1;
     let [width, height] = layer.samples.map(i64::from);
     let places: Vec<[usize; 2]> = Block::empty(forest, level).places().collect();
     let largest = |d: &Diamond| {
         let local = forest.local(*d);
-        let mut largest = floor;
+        let mut largest = None;
         for [p, q] in places.iter().filter(|[p, q]| local.upper || q <= p) {
             #[allow(clippy::cast_possible_wrap, reason = "at most 256")]
             let [x, y] = local.lattice2([*p as i64, *q as i64]);
@@ -573,8 +597,10 @@ fn mask(layer: &Layer, shares: &Tiled<u8>, floor: u8, layers: usize) -> Mask {
                     clippy::cast_sign_loss,
                     reason = "within the layer"
                 )]
-                let share = shares.at([x as usize, y as usize]);
-                largest = largest.max(share);
+                let at = [x as usize, y as usize];
+                if relief.is_none_or(|relief| relief.at(at) != NODATA) {
+                    largest = largest.max(Some(shares.at(at).max(floor)));
+                }
             }
         }
         largest
@@ -585,5 +611,5 @@ fn mask(layer: &Layer, shares: &Tiled<u8>, floor: u8, layers: usize) -> Mask {
         let some: Vec<Diamond> = diamonds.by_ref().take(DIAMONDS_AT_ONCE).collect();
         finest.par_extend(some.par_iter().map(largest));
     }
-    Mask::saturated(*forest, floor, layers, finest)
+    finest
 }

@@ -10,12 +10,12 @@ use diamantina_protocol::bintree::Point;
 use diamantina_protocol::bitree::Bitree;
 use std::ops::ControlFlow;
 
-/// Times that all points are tried: later passes find a handful.
+/// Times that points are tried: later passes find a handful.
 const PASSES_MAX: usize = 3;
 
 /// Removes points while every triangle stays within `tolerance`. If all were before, all are after.
 pub fn prune(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, tree: &mut Bitree) {
-    let all = all(ground, tree);
+    let all = real_points(ground, tree, |_| true);
     prune_among(ground, criterion, tolerance, tree, all);
 }
 
@@ -30,22 +30,20 @@ pub(super) fn prune_among(
     for _ in 0..PASSES_MAX {
         // The finest first, and row by row.
         may_go.sort_unstable_by_key(|p| (std::cmp::Reverse(tree.level(*p)), p[1], p[0]));
-        let mut removed = 0;
+        let mut removed = Areas::new(tree.log2());
         for point in may_go {
-            if has_to_stay(ground, criterion, tolerance, tree, point) {
-                continue;
-            }
-            let Some(height) = tree.remove(point) else { continue };
-            if is_good(ground, criterion, tolerance, tree, point) {
-                removed += 1;
-            } else {
-                tree.add(point, height);
+            if !has_to_stay(ground, criterion, tolerance, tree, point)
+                && is_good_without(ground, criterion, tolerance, tree, point)
+                && tree.remove(point).is_some()
+            {
+                removed.insert(point);
             }
         }
-        if removed == 0 {
+        if removed.is_empty() {
             return;
         }
-        may_go = all(ground, tree);
+        // Around the others nothing has changed, and they would stay again.
+        may_go = real_points(ground, tree, |point| removed.overlap(point));
     }
 }
 
@@ -57,24 +55,95 @@ fn has_to_stay(
     tree: &Bitree,
     point: Point,
 ) -> bool {
-    let Some(facet) = tree.around(point).into_iter().flatten().next() else { return false };
-    let [ha, _, hb] = facet.heights();
-    let off = ground.field().at(point) - (ha + hb) / 2.0;
-    criterion.is_beyond(ground, ground.field().slot(point), off, tolerance)
+    let Some(without) = tree.height_without(point) else { return true };
+    criterion.is_beyond(ground, ground.field().slot(point), ground.field().at(point) - without, tolerance)
 }
 
-/// Every real point; the corners, which always stay, do no harm.
-fn all(ground: &Ground<'_>, tree: &Bitree) -> Vec<Point> {
+/// The real points that a rule lets through; corners, which always stay, do no harm.
+fn real_points(ground: &Ground<'_>, tree: &Bitree, is_wanted: impl Fn(Point) -> bool) -> Vec<Point> {
     let field = ground.field();
     let points = (0..field.heights().len()).map(|slot| field.point(slot));
-    points.filter(|p| tree.real(*p).is_some()).collect()
+    points.filter(|p| tree.real(*p).is_some() && is_wanted(*p)).collect()
 }
 
-/// Whether all that is drawn around a point is within the tolerance.
-fn is_good(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, tree: &Bitree, point: Point) -> bool {
+/// Whether all that is drawn around a point would be within the tolerance without it.
+fn is_good_without(
+    ground: &Ground<'_>,
+    criterion: Criterion,
+    tolerance: f64,
+    tree: &Bitree,
+    point: Point,
+) -> bool {
     let within =
         |found: f64| if found > tolerance { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
     tree.around(point).into_iter().flatten().all(|facet| {
-        tree.leaves(&facet, &mut |leaf| within(criterion.error(ground, leaf, tolerance))).is_continue()
+        let visit = &mut |leaf: &_| within(criterion.error(ground, leaf, tolerance));
+        tree.leaves_without_middle(&facet, visit).is_continue()
     })
+}
+
+/// The squares around points that reach as far as the triangles in whose middle these stand: 2^z cells to each side,
+/// z being the number of times that both coordinates can be halved. So they lie on the lattice of that step.
+struct Areas {
+    log2: u8,
+    /// By z: the cells of 2^z that are covered by squares of this and finer steps, and by those of this step alone.
+    cells: Vec<[Vec<u64>; 2]>,
+    is_empty: bool,
+}
+
+impl Areas {
+    fn new(log2: u8) -> Self {
+        let words = |z: u8| (1usize << (2 * (log2 - z))).div_ceil(64);
+        let cells = (0..=log2).map(|z| [vec![0; words(z)], vec![0; words(z)]]).collect();
+        Self { log2, cells, is_empty: true }
+    }
+
+    fn is_empty(&self) -> bool {
+        self.is_empty
+    }
+
+    fn insert(&mut self, point: Point) {
+        self.is_empty = false;
+        let own = zeros(point);
+        for z in own..=u32::from(self.log2) {
+            for cell in cells(self.log2, point, own, z) {
+                let bit = 1 << (cell % 64);
+                let [upto, exact] = &mut self.cells[z as usize];
+                upto[cell / 64] |= bit;
+                if z == own {
+                    exact[cell / 64] |= bit;
+                }
+            }
+        }
+    }
+
+    /// Whether the square around a point shares a cell with any of them.
+    fn overlap(&self, point: Point) -> bool {
+        let own = zeros(point).min(u32::from(self.log2));
+        (own..=u32::from(self.log2)).any(|z| {
+            let [upto, exact] = &self.cells[z as usize];
+            let covered = if z == own { upto } else { exact };
+            cells(self.log2, point, own, z).any(|cell| covered[cell / 64] >> (cell % 64) & 1 == 1)
+        })
+    }
+}
+
+/// The times that both coordinates can be halved.
+fn zeros([x, y]: Point) -> u32 {
+    (x | y).trailing_zeros()
+}
+
+/// The numbers of the cells of 2^z, on a grid, in which the square of 2^`own` cells to each side of a point lies, z being
+/// no less than `own`; some twice.
+fn cells(log2: u8, [x, y]: Point, own: u32, z: u32) -> impl Iterator<Item = usize> {
+    let side = 1usize << log2;
+    // By the middles of the square's quarters.
+    let along = move |w: u32, forth: bool| {
+        let middle = 2 * w as usize + (usize::from(forth) << (own + 1));
+        let middle = middle.checked_sub(1 << own)?;
+        (middle < 2 * side).then_some(middle >> (z + 1))
+    };
+    [(false, false), (true, false), (false, true), (true, true)]
+        .into_iter()
+        .filter_map(move |(east, north)| Some((along(y, north)? * (side >> z)) + along(x, east)?))
 }
