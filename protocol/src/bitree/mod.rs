@@ -227,24 +227,33 @@ impl Bitree {
         let zeros = (x | y).trailing_zeros();
         let [dx, dy] = if (x >> zeros) & 1 == 1 && (y >> zeros) & 1 == 0 { [0, 1] } else { [1, 0] };
         [1, -1].map(|sign| {
-            let probe = [4 * i64::from(x) + sign * dx, 4 * i64::from(y) + sign * dy];
+            let probe = [4 * x.cast_signed() + sign * dx, 4 * y.cast_signed() + sign * dy];
             self.descend(probe, level - 1)
         })
     }
 
     /// The triangle of a level that has a place, in quarters of cells, strictly inside.
-    fn descend(&self, place: [i64; 2], level: u32) -> Option<Facet> {
-        let end = 4 * i64::from(self.side());
+    fn descend(&self, place: [i32; 2], level: u32) -> Option<Facet> {
+        let end = 4 << self.log2;
         if place.iter().any(|v| !(0..=end).contains(v)) {
             return None;
         }
         let [lower, upper] = self.roots();
         let mut at = if place[0] > place[1] { lower } else { upper };
         for _ in 0..level {
-            let (m, c) = (at.middle().map(i64::from), at.corners[1].map(i64::from));
-            let (along, to) = ([m[0] - c[0], m[1] - c[1]], [place[0] - 4 * c[0], place[1] - 4 * c[1]]);
-            let [left, right] = self.halves(&at);
-            at = if along[0] * to[1] > along[1] * to[0] { left } else { right };
+            let ([a, c, b], [ha, hc, hb]) = (at.corners, at.heights);
+            let m = at.middle();
+            let own = self.real[self.slot(m)];
+            let hm = if own.is_nan() { (ha + hb) / 2.0 } else { own };
+            // Four times the grid's side at most, so products stay below 2^30.
+            let [mx, my, cx, cy] = [m[0], m[1], c[0], c[1]].map(u32::cast_signed);
+            let is_left = (mx - cx) * (place[1] - 4 * cy) > (my - cy) * (place[0] - 4 * cx);
+            // As in `halves`, but for one of them.
+            at = if is_left {
+                Facet { path: at.path << 1, corners: [c, m, a], heights: [hc, hm, ha] }
+            } else {
+                Facet { path: at.path << 1 | 1, corners: [b, m, c], heights: [hb, hm, hc] }
+            };
         }
         Some(at)
     }
@@ -311,21 +320,40 @@ impl Bitree {
         ControlFlow::Continue(())
     }
 
-    /// The same, were the middle of a split triangle not real: what removing it would leave.
-    pub fn leaves_without_middle(
+    /// The triangles that would be drawn otherwise, of those at or below one, were its middle not real: as they would be
+    /// then. Most of what is below hangs on other points. Calls `visit` with each, until it breaks.
+    pub fn changes_without_middle(
         &self,
         from: &Facet,
         visit: &mut impl FnMut(&Facet) -> ControlFlow<()>,
     ) -> ControlFlow<()> {
-        let is_last = self.below.get(from.path as usize).is_none_or(|count| *count <= 1);
-        if is_last {
+        if self.below.get(from.path as usize).is_none_or(|count| *count <= 1) {
             return visit(from);
         }
         let [ha, hc, hb] = from.heights;
         let hm = (ha + hb) / 2.0;
-        for (mut half, heights) in self.halves(from).into_iter().zip([[hc, hm, ha], [hb, hm, hc]]) {
-            half.heights = heights;
-            self.leaves(&half, visit)?;
+        for (half, heights) in self.halves(from).iter().zip([[hc, hm, ha], [hb, hm, hc]]) {
+            self.changes(half, heights, visit)?;
+        }
+        ControlFlow::Continue(())
+    }
+
+    /// The triangles drawn at or below one that have other heights once its corners have others.
+    fn changes(
+        &self,
+        from: &Facet,
+        to: [f64; 3],
+        visit: &mut impl FnMut(&Facet) -> ControlFlow<()>,
+    ) -> ControlFlow<()> {
+        if from.heights == to {
+            return ControlFlow::Continue(());
+        }
+        let changed = Facet { heights: to, ..*from };
+        if !self.is_split(from) {
+            return visit(&changed);
+        }
+        for (half, changed) in self.halves(from).iter().zip(self.halves(&changed)) {
+            self.changes(half, changed.heights, visit)?;
         }
         ControlFlow::Continue(())
     }
@@ -519,7 +547,7 @@ mod tests {
     }
 
     #[test]
-    fn what_removing_leaves_is_told_beforehand() {
+    fn what_removing_changes_is_told_beforehand() {
         let mut bitree = flat(3);
         for (point, height) in [([4, 4], 3.0), ([1, 2], -7.0), ([5, 0], 11.0), ([8, 4], 6.0), ([6, 2], 1.0)] {
             bitree.add(point, height);
@@ -528,17 +556,17 @@ mod tests {
             let mut removed = bitree.clone();
             removed.remove(point);
             for (before, after) in bitree.around(point).into_iter().zip(removed.around(point)) {
-                let [mut told, mut found] = [Vec::new(), Vec::new()];
                 let (Some(before), Some(after)) = (before, after) else { continue };
-                let _ = bitree.leaves_without_middle(&before, &mut |facet| {
-                    told.push(*facet);
+                let [mut told, mut was, mut is] = [Vec::new(), Vec::new(), Vec::new()];
+                let into = |list: &mut Vec<Facet>, facet: &Facet| {
+                    list.push(*facet);
                     ControlFlow::Continue(())
-                });
-                let _ = removed.leaves(&after, &mut |facet| {
-                    found.push(*facet);
-                    ControlFlow::Continue(())
-                });
-                assert_eq!(told, found, "{point:?}");
+                };
+                let _ = bitree.changes_without_middle(&before, &mut |facet| into(&mut told, facet));
+                let _ = bitree.leaves(&before, &mut |facet| into(&mut was, facet));
+                let _ = removed.leaves(&after, &mut |facet| into(&mut is, facet));
+                is.retain(|facet| !was.contains(facet));
+                assert_eq!(told, is, "{point:?}");
             }
         }
     }

@@ -575,12 +575,7 @@ impl Tally {
 
 /// The visibility of each diamond of the finest level: the largest of its samples, borders included; `None` where none
 /// has data. Of a layer without relief nothing is known, and all of it is as visible as its shares say.
-fn finest_shares(
-    layer: &Layer,
-    shares: &Tiled<u8>,
-    relief: Option<&Relief>,
-    floor: u8,
-) -> Vec<Option<u8>> {
+fn finest_shares(layer: &Layer, shares: &Tiled<u8>, relief: Option<&Relief>, floor: u8) -> Vec<Option<u8>> {
     let forest = &layer.forest;
     let level = forest.levels() - 1;
     let [width, height] = layer.samples.map(i64::from);

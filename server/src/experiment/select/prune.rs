@@ -15,7 +15,7 @@ const PASSES_MAX: usize = 3;
 
 /// Removes points while every triangle stays within `tolerance`. If all were before, all are after.
 pub fn prune(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, tree: &mut Bitree) {
-    let all = real_points(ground, tree, |_| true);
+    let all = real_points(tree, |_| true);
     prune_among(ground, criterion, tolerance, tree, all);
 }
 
@@ -27,9 +27,9 @@ pub(super) fn prune_among(
     tree: &mut Bitree,
     mut may_go: Vec<Point>,
 ) {
-    for _ in 0..PASSES_MAX {
-        // The finest first, and row by row.
-        may_go.sort_unstable_by_key(|p| (std::cmp::Reverse(tree.level(*p)), p[1], p[0]));
+    // The finest first, and row by row.
+    may_go.sort_unstable_by_key(|p| (std::cmp::Reverse(tree.level(*p)), p[1], p[0]));
+    for pass in 1..=PASSES_MAX {
         let mut removed = Areas::new(tree.log2());
         for point in may_go {
             if !has_to_stay(ground, criterion, tolerance, tree, point)
@@ -39,11 +39,11 @@ pub(super) fn prune_among(
                 removed.insert(point);
             }
         }
-        if removed.is_empty() {
+        if removed.is_empty() || pass == PASSES_MAX {
             return;
         }
         // Around the others nothing has changed, and they would stay again.
-        may_go = real_points(ground, tree, |point| removed.overlap(point));
+        may_go = real_points(tree, |point| removed.overlap(point));
     }
 }
 
@@ -59,14 +59,29 @@ fn has_to_stay(
     criterion.is_beyond(ground, ground.field().slot(point), ground.field().at(point) - without, tolerance)
 }
 
-/// The real points that a rule lets through; corners, which always stay, do no harm.
-fn real_points(ground: &Ground<'_>, tree: &Bitree, is_wanted: impl Fn(Point) -> bool) -> Vec<Point> {
-    let field = ground.field();
-    let points = (0..field.heights().len()).map(|slot| field.point(slot));
-    points.filter(|p| tree.real(*p).is_some() && is_wanted(*p)).collect()
+/// The real points that a rule lets through, the finest first, and row by row; without the corners, which always stay.
+fn real_points(tree: &Bitree, is_wanted: impl Fn(Point) -> bool) -> Vec<Point> {
+    let side = tree.side();
+    let mut points = Vec::new();
+    for step in (0..tree.log2()).map(|z| 1u32 << z) {
+        // Middles of the sides of squares, then their centres.
+        for is_centre in [false, true] {
+            for y in (0..=side).step_by(step as usize) {
+                let is_odd = y & step > 0;
+                let first = match (is_centre, is_odd) {
+                    (true, false) => continue,
+                    (false, true) => 0,
+                    (true, true) | (false, false) => step,
+                };
+                let row = (first..=side).step_by(2 * step as usize).map(|x| [x, y]);
+                points.extend(row.filter(|p| tree.real(*p).is_some() && is_wanted(*p)));
+            }
+        }
+    }
+    points
 }
 
-/// Whether all that is drawn around a point would be within the tolerance without it.
+/// Whether all that would be drawn otherwise without a point would be within the tolerance.
 fn is_good_without(
     ground: &Ground<'_>,
     criterion: Criterion,
@@ -78,7 +93,7 @@ fn is_good_without(
         |found: f64| if found > tolerance { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
     tree.around(point).into_iter().flatten().all(|facet| {
         let visit = &mut |leaf: &_| within(criterion.error(ground, leaf, tolerance));
-        tree.leaves_without_middle(&facet, visit).is_continue()
+        tree.changes_without_middle(&facet, visit).is_continue()
     })
 }
 

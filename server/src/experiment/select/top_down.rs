@@ -50,6 +50,8 @@ pub(super) fn descend(
     // How many of a point's triangles are split for their own sake; a point is the middle of those of one level.
     let mut split_at = vec![0u8; field.heights().len()];
     let mut may_go = Vec::new();
+    // Kept from level to level: to have so much memory anew each time would take a third of all.
+    let (mut split, mut across) = (Vec::new(), Vec::new());
     for level in 0..finest {
         now.retain(|facet| {
             // The middle is one of the samples, and often tells enough.
@@ -60,7 +62,7 @@ pub(super) fn descend(
         for facet in &now {
             split_at[field.slot(facet.middle())] += 1;
         }
-        let mut across = Vec::new();
+        across.clear();
         for facet in &now {
             let m = facet.middle();
             let off = off(ground, facet);
@@ -87,12 +89,14 @@ pub(super) fn descend(
                 }
             }
         }
-        let split = std::mem::take(&mut now);
+        std::mem::swap(&mut split, &mut now);
         if level + 1 == finest {
             break;
         }
-        for facet in split.into_iter().chain(across).filter(|facet| queued.insert(facet.path())) {
-            now.extend(draft.halves(&facet));
+        now.clear();
+        now.reserve(2 * (split.len() + across.len()));
+        for facet in split.iter().chain(&across).filter(|facet| queued.insert(facet.path())) {
+            now.extend(draft.halves(facet));
         }
     }
     (draft.finish(), may_go)
