@@ -30,7 +30,7 @@ demo:
 	@$(step) build cargo build --locked --release -p diamantina-server -p diamantina-client
 	$(target)/release/diamantina-server demo
 
-test: setup fmt clippy tests contract objects doc deny wasm scripts
+test: setup fmt clippy tests contract objects doc deny wasm web-test scripts
 
 check: fmt clippy
 
@@ -66,6 +66,7 @@ bench-peers:
 
 setup:
 	@$(step) setup scripts/setup test
+	@$(step) setup scripts/setup web
 
 fmt:
 	@$(step) fmt cargo fmt --all --check
@@ -102,10 +103,7 @@ web:
 	@$(step) setup scripts/setup web
 	@$(step) web scripts/web
 
-# Ten minutes where nothing of it is built yet.
-web-test:
-	@$(step) setup scripts/setup test
-	@$(step) setup scripts/setup web
+web-test: setup
 	@$(step) web-test scripts/web-test
 
 scripts:
