@@ -100,8 +100,8 @@ pub fn start() {
     });
 }
 
-/// The options of the page's address.
-fn options(address: &Address) -> Result<terrain::Options, String> {
+/// The options of the page's address, with the token that the page was given.
+fn options(address: &Address, token: Option<String>) -> Result<terrain::Options, String> {
     let encoding = match address.asked("encoding") {
         None => Encoding::default(),
         Some(name) => Encoding::of(&name)
@@ -125,14 +125,14 @@ fn options(address: &Address) -> Result<terrain::Options, String> {
         zone: address.asked("zone"),
         time: viewer::time_at(&address.view).unwrap_or(0.0),
         imagery: Imagery::asked(address.asked("texture")),
-        fetch: fetch::Options { encoding, ..fetch::Options::default() },
+        fetch: fetch::Options { encoding, token: token.map(Into::into), ..fetch::Options::default() },
         ..terrain::Options::default()
     })
 }
 
 async fn open(page: &Page) -> Result<(), String> {
     let address = Address::of(page);
-    let options = options(&address)?;
+    let options = options(&address, page.token())?;
     let backends = match address.asked("graphics").as_deref() {
         None | Some("webgpu") => render::BACKENDS,
         Some("webgl") => wgpu::Backends::GL,
@@ -143,6 +143,11 @@ async fn open(page: &Page) -> Result<(), String> {
     let terrain = match Terrain::connect(&address.scene_url(), options).await {
         Err(TerrainError::Fetch(FetchError::Choose(names))) if !names.is_empty() => {
             page.choose(&names);
+            return Ok(());
+        }
+        // Nobody is told which scenes are private.
+        Err(error @ TerrainError::Fetch(FetchError::Status { status: 404, .. })) => {
+            page.ask_token(&error.to_string());
             return Ok(());
         }
         terrain => terrain.map_err(|e| e.to_string())?,

@@ -1,14 +1,15 @@
 // The viewer in a headless Chromium, as a person uses it, on WebGPU and on WebGL2. Whatever is drawn is judged by its
 // pixels: a page whose device is lost at the first frame goes on counting frames.
 //
-// node check.mjs PLAYWRIGHT CHROMIUM URL CLIENT FOLDER: the folder of playwright-core, the browser, the server of scenes
-// `hills`, `plain`, `lake` (hills and water) and `photo` (hills and imagery), the client's program, and a folder for pictures.
+// node check.mjs PLAYWRIGHT CHROMIUM URL CLIENT FOLDER TOKEN: the folder of playwright-core, the browser, the server of scenes
+// `hills`, `lake` (hills and water), `photo` (hills and imagery) and `plain`, which is private, the client's program, a folder for
+// pictures, and the token of `plain`.
 import { execFileSync } from 'node:child_process';
 import { readFileSync, writeFileSync } from 'node:fs';
 import { createRequire } from 'node:module';
 import { join } from 'node:path';
 
-const [playwright, executablePath, url, client, folder] = process.argv.slice(2);
+const [playwright, executablePath, url, client, folder, token] = process.argv.slice(2);
 const { chromium } = createRequire(join(playwright, 'package.json'))('playwright-core');
 
 const SIZE = { width: 900, height: 600 };
@@ -186,12 +187,24 @@ async function choice(page) {
     const links = page.locator('#message a');
     await links.first().waitFor({ timeout: PATIENCE });
     const names = await links.allTextContents();
-    check(names.toSorted().join() === 'hills,lake,photo,plain', `to choose from: ${names}`);
+    check(names.toSorted().join() === 'hills,lake,photo', `to choose from: ${names}`);
     await links.first().click();
     await page.waitForFunction(() => window.diamantina?.state().frames > 0, null, { timeout: PATIENCE });
     check((await state(page)).scene === 'hills', 'another scene was chosen');
     await page.goto(`${url}/?scene=nowhere`);
     await page.locator('#message.failed').waitFor({ timeout: PATIENCE });
+}
+
+/// A private scene, which is not there without its token.
+async function secret(page) {
+    await page.goto(`${url}/?scene=plain`);
+    await page.screenshot({ path: join(folder, 'token.png') });
+    for (const given of ['wrong', token]) {
+        await page.locator('#message input').fill(given, { timeout: PATIENCE });
+        await Promise.all([page.waitForEvent('load'), page.locator('#message button').click()]);
+    }
+    await page.waitForFunction(() => window.diamantina?.state().scene === 'plain', null, { timeout: PATIENCE });
+    check(!page.url().includes(token), 'the token is in the address');
 }
 
 const reference = headless('hills', VIEW, join(folder, 'client.png'));
@@ -220,7 +233,10 @@ for (const graphics of ['webgpu', 'webgl']) {
         });
         // Of a scene that is not there the browser says so by itself.
         allowed = /404/;
-        if (graphics === 'webgpu') await choice(page);
+        if (graphics === 'webgpu') {
+            await choice(page);
+            await secret(page);
+        }
         check(wrong.length === 0, `${graphics}: the console says ${wrong.join(' | ')}`);
         console.log(`${graphics}: ${what}, ${((Date.now() - began) / 1000).toFixed(1)} s`);
     } finally {

@@ -22,7 +22,7 @@ pub enum FetchError {
     Transport(String),
     /// An error of the server.
     #[error("{route}: the server answers {status}: {}", match status {
-        404 => "is the name right? GET /scenes lists the scenes",
+        404 => "is the name right? GET /scenes lists the scenes; a private one needs its token",
         400..500 => "is this a Diamantina server of the same version?",
         _ => "try again later; its log says why",
     })]

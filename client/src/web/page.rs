@@ -6,13 +6,19 @@ use std::rc::Rc;
 use wasm_bindgen::JsCast;
 use wasm_bindgen::closure::Closure;
 use wasm_bindgen_futures::{JsFuture, spawn_local};
-use web_sys::{Blob, Document, HtmlAnchorElement, HtmlCanvasElement, HtmlElement, Url, Window};
+use web_sys::{
+    Blob, Document, Element, Event, HtmlAnchorElement, HtmlCanvasElement, HtmlElement, HtmlInputElement, Url,
+    Window,
+};
 
 /// The canvas's name in the page.
 const CANVAS: &str = "terrain";
 
 /// The name of the element that says what there is to say.
 const MESSAGE: &str = "message";
+
+/// The name under which the browser keeps the token, as long as the page's tab is open.
+const TOKEN: &str = "diamantina token";
 
 /// The page around the canvas.
 #[derive(Debug, Clone)]
@@ -81,6 +87,47 @@ impl Page {
         self.message.set_text_content(Some(why));
         self.message.set_class_name("failed");
         self.message.set_hidden(false);
+    }
+
+    /// Says why there is nothing to see, and that a token may help, with a field for it.
+    pub(super) fn ask_token(&self, why: &str) {
+        self.fail(why);
+        // A page that cannot have a form says why all the same.
+        let _ = self.append_token_form();
+    }
+
+    fn append_token_form(&self) -> Result<(), wasm_bindgen::JsValue> {
+        let element = |name: &str| self.document.create_element(name);
+        let form = element("form")?;
+        let label = element("label")?;
+        label.set_text_content(Some("Token"));
+        let field: HtmlInputElement = element("input")?.dyn_into().map_err(Element::from)?;
+        field.set_type("password");
+        field.set_attribute("autocomplete", "off")?;
+        field.set_required(true);
+        label.append_child(&field)?;
+        let button = element("button")?;
+        button.set_text_content(Some("Open"));
+        form.append_child(&label)?;
+        form.append_child(&button)?;
+        let window = self.window.clone();
+        let submit = Closure::<dyn FnMut(Event)>::new(move |event: Event| {
+            event.prevent_default();
+            if let Ok(Some(storage)) = window.session_storage() {
+                let _ = storage.set_item(TOKEN, field.value().trim());
+            }
+            let _ = window.location().reload();
+        });
+        form.add_event_listener_with_callback("submit", submit.as_ref().unchecked_ref())?;
+        // As long as the page.
+        submit.forget();
+        self.message.append_child(&form)?;
+        Ok(())
+    }
+
+    /// The token that was given on this page, or on one before it in the same tab.
+    pub(super) fn token(&self) -> Option<String> {
+        self.window.session_storage().ok()??.get_item(TOKEN).ok()?
     }
 
     /// Offers scenes to choose from.
