@@ -211,6 +211,13 @@ impl Mask {
     pub fn share(&self, d: Diamond) -> f64 {
         f64::from(self.get(d)) / 255.0
     }
+
+    /// Diamonds of a level and how many of them are hidden.
+    #[must_use]
+    pub fn tally(&self, level: u32) -> [u64; 2] {
+        let level = self.levels.get(level as usize).map_or(&[][..], Vec::as_slice);
+        [level.len() as u64, level.iter().filter(|v| **v == self.floor).count() as u64]
+    }
 }
 
 /// Half spacings of a level along x and y: see [`Forest::diamonds`].
