@@ -494,7 +494,7 @@ fn no_bit_of_the_description_can_flip_unseen() {
 /// A store with a small scene, and a larger DEM to build into it. The old scene's files.
 fn old_scene(folder: &Path) -> std::collections::BTreeMap<PathBuf, Vec<u8>> {
     sample::write(&folder.join("old.tif"), 257).unwrap();
-    sample::write(&folder.join("new.tif"), 1500).unwrap();
+    sample::write(&folder.join("new.tif"), 1100).unwrap();
     let ended = server(folder, "build {}/old.tif -o {}/disk/store --scene keep");
     assert_eq!(ended.code, Some(0), "{ended:?}");
     scene_files(folder)

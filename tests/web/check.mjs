@@ -207,9 +207,9 @@ async function choice(page) {
 /// A private scene, which is not there without its token.
 async function secret(page) {
     await page.goto(`${url}/?scene=plain`);
-    await page.screenshot({ path: join(folder, 'token.png') });
     for (const given of ['wrong', token]) {
         await page.locator('#message input').fill(given, { timeout: PATIENCE });
+        await page.locator('#message').screenshot({ path: join(folder, 'token.png') });
         await Promise.all([page.waitForEvent('load'), page.locator('#message button').click()]);
     }
     await page.waitForFunction(() => window.diamantina?.state().scene === 'plain', null, { timeout: PATIENCE });

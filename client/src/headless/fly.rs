@@ -50,7 +50,7 @@ pub struct FrameLine {
     pub cut_ms: f64,
     /// Milliseconds to upload and draw, until the picture is there; and to read it back, where pictures are.
     pub draw_ms: f64,
-    /// The largest error of what is drawn, in pixels, as in [`PictureReport`]; `inf` until all roots are there.
+    /// The largest error of what is drawn, in pixels, as in [`super::PictureReport`]; `inf` until all roots are there.
     pub error_pixels: f64,
     /// The error of the ideal cut.
     pub goal_pixels: f64,
