@@ -16,7 +16,10 @@ const [width, height] = size.split('x').map(Number);
 const SIZE = { width, height };
 // On the ground, not far from the middle.
 const GROUND = [Math.round(width / 2), Math.round(2 * height / 3)];
-const ERROR_PIXELS = 2;
+// Small pages are for those who want to know soon. In software each page takes a quarter of a minute before it shows anything,
+// so fewer are opened then.
+const QUICK = width < 900;
+const ERROR_PIXELS = QUICK ? 4 : 2;
 // From the south-west, down into the hills.
 const VIEW = { eye: [2500, 500, 2600], heading: 25, pitch: 32 };
 const PATIENCE = 60_000;
@@ -132,14 +135,16 @@ async function heights(page, reference, blank, graphics) {
     check((await compare(blank, [before, shot])).off > 0.05, 'nothing moved on the picture');
 
     // The address opens the same view again.
-    await page.goto('about:blank');
-    await page.goto(link);
-    await settled(page);
-    await page.keyboard.press('Tab');
-    await frames(page, 3);
-    const again = await compare(blank, [before, await page.screenshot()]);
-    // What was clicked is marked in the one and not in the other.
-    check(again.mean < 2 && again.off < 0.01, `the address opens another view: ${JSON.stringify(again)}`);
+    if (!QUICK || graphics === 'webgpu') {
+        await page.goto('about:blank');
+        await page.goto(link);
+        await settled(page);
+        await page.keyboard.press('Tab');
+        await frames(page, 3);
+        const again = await compare(blank, [before, await page.screenshot()]);
+        // What was clicked is marked in the one and not in the other.
+        check(again.mean < 2 && again.off < 0.01, `the address opens another view: ${JSON.stringify(again)}`);
+    }
 
     // Who changes the address is flown there.
     await page.evaluate((there) => { location.hash = there; }, hash(VIEW));
@@ -169,8 +174,7 @@ async function water(page, blank, graphics) {
     check(beside.mean < 6 && beside.off < 0.1, `water differs from the client's: ${JSON.stringify(beside)}`);
     await frames(page, 20);
     check((await compare(blank, [wet, await page.screenshot()])).mean > 0, 'the waves stand still');
-    // The same page on both, but for what draws it.
-    if (graphics === 'webgpu') {
+    if (!QUICK) {
         const without = await compare(blank, [wet, await shot('&layer=terrain', 'dry')]);
         check(without.off > 0.05, `water is hardly seen: ${JSON.stringify(without)}`);
     }
@@ -183,7 +187,7 @@ async function imagery(page, blank, graphics) {
     const draped = await shot('', 'photo');
     const beside = await compare(blank, [draped, photo]);
     check(beside.mean < 2 && beside.off < 0.01, `imagery differs from the client's: ${JSON.stringify(beside)}`);
-    if (graphics === 'webgpu') {
+    if (!QUICK) {
         const without = await compare(blank, [draped, await shot('&texture=none', 'bare')]);
         check(without.off > 0.1, `imagery is hardly seen: ${JSON.stringify(without)}`);
     }
