@@ -194,6 +194,13 @@ fn a_zone_is_published_listed_served_and_gone_again() {
     // Levels past the finest lattice, too, are told.
     let masks = inspect::masks(&store, 0).unwrap();
     assert_eq!(masks[0].levels(), scene.layers[0].forest.levels());
+    // All of it has data; so what is counted is what the mask says.
+    let number = |name: &str| report[name].as_u64().unwrap();
+    assert_eq!(number("samples"), scene.layers[0].valid_samples);
+    assert!(number("samples_seen") > 0 && number("samples_hidden") > 0);
+    assert!(number("samples_seen") + number("samples_hidden") <= number("samples"));
+    let finest = masks[0].tally(masks[0].levels() - 1);
+    assert_eq!([number("diamonds"), number("diamonds_hidden")], finest);
     assert!(inspect::inspect(&store, true).is_ok());
     let inspected = Command::new(&programs().server).arg("inspect").arg(&lake.store).output().unwrap();
     let text = String::from_utf8(inspected.stdout).unwrap();

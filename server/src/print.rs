@@ -284,7 +284,7 @@ pub(super) fn zone(out: &mut impl Write, store: &Path, r: &zone::Report) -> std:
     )?;
     writeln!(
         out,
-        "  {:.1} % of {} samples are seen, {:.1} % are hidden; of {} diamonds {:.1} % are hidden",
+        "  {:.1} % of {} samples are seen, {:.1} % are hidden, the rest counts in between; of {} diamonds {:.1} % are hidden",
         share(r.samples_seen, r.samples),
         r.samples,
         share(r.samples_hidden, r.samples),

@@ -15,7 +15,7 @@ const PASSES_MAX: usize = 3;
 
 /// Removes points while every triangle stays within `tolerance`. If all were before, all are after.
 pub fn prune(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, tree: &mut Bitree) {
-    let all = real_points(tree, |_| true);
+    let all = real_points(tree);
     prune_among(ground, criterion, tolerance, tree, all);
 }
 
@@ -29,10 +29,16 @@ pub(super) fn prune_among(
 ) {
     // The finest first, and row by row.
     may_go.sort_unstable_by_key(|p| (std::cmp::Reverse(tree.level(*p)), p[1], p[0]));
+    let mut last: Option<Areas> = None;
     for pass in 1..=PASSES_MAX {
         let mut removed = Areas::new(tree.log2());
         for point in may_go {
-            if !has_to_stay(ground, criterion, tolerance, tree, point)
+            if has_to_stay(ground, criterion, tolerance, tree, point) {
+                continue;
+            }
+            // Where nothing has changed since it was tried, it would stay again.
+            let is_tried = last.as_ref().is_some_and(|last| !last.overlap(point) && !removed.overlap(point));
+            if !is_tried
                 && is_good_without(ground, criterion, tolerance, tree, point)
                 && tree.remove(point).is_some()
             {
@@ -42,8 +48,8 @@ pub(super) fn prune_among(
         if removed.is_empty() || pass == PASSES_MAX {
             return;
         }
-        // Around the others nothing has changed, and they would stay again.
-        may_go = real_points(tree, |point| removed.overlap(point));
+        may_go = real_points(tree);
+        last = Some(removed);
     }
 }
 
@@ -59,8 +65,8 @@ fn has_to_stay(
     criterion.is_beyond(ground, ground.field().slot(point), ground.field().at(point) - without, tolerance)
 }
 
-/// The real points that a rule lets through, the finest first, and row by row; without the corners, which always stay.
-fn real_points(tree: &Bitree, is_wanted: impl Fn(Point) -> bool) -> Vec<Point> {
+/// The real points, the finest first, and row by row; without the corners, which always stay.
+fn real_points(tree: &Bitree) -> Vec<Point> {
     let side = tree.side();
     let mut points = Vec::new();
     for step in (0..tree.log2()).map(|z| 1u32 << z) {
@@ -74,7 +80,7 @@ fn real_points(tree: &Bitree, is_wanted: impl Fn(Point) -> bool) -> Vec<Point> {
                     (true, true) | (false, false) => step,
                 };
                 let row = (first..=side).step_by(2 * step as usize).map(|x| [x, y]);
-                points.extend(row.filter(|p| tree.real(*p).is_some() && is_wanted(*p)));
+                points.extend(row.filter(|p| tree.real(*p).is_some()));
             }
         }
     }

@@ -167,6 +167,66 @@ proptest! {
 }
 
 #[test]
+fn on_larger_fields_nothing_that_could_go_is_passed_over() {
+    const LOG2: u8 = 7;
+    let side = 1usize << LOG2;
+    for seed in 0..8u32 {
+        let mut state = seed;
+        let mut noise = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            f64::from(state >> 24) - 128.0
+        };
+        let heights = (0..(side + 1).pow(2)).map(|s| {
+            let (x, y) = ((s % (side + 1)) as f64, (s / (side + 1)) as f64);
+            (300.0 * (x / 23.0).sin() * (y / 17.0).cos() + noise() * (0.1 + x / 200.0)).round()
+        });
+        let field = Field::new(LOG2, heights.collect(), [30.0, 30.0]).unwrap();
+        let ground = Ground::new(&field, None).unwrap();
+        for (criterion, share) in
+            [Criterion::Vertical, Criterion::Euclidean].into_iter().flat_map(|c| [(c, 0.0), (c, 1.0)])
+        {
+            let tolerance = 0.01 * f64::from(1 + seed) * field.relief();
+            let refined = greedy(
+                &ground,
+                criterion,
+                tolerance,
+                GREEDY_SHARE,
+                usize::MAX,
+                top_down(&ground, criterion, tolerance, share),
+            );
+            let [mut tried, mut all] = [refined.clone(), refined];
+            prune(&ground, criterion, tolerance, &mut tried);
+            // Every point in each of the passes, by what is drawn around it.
+            let points = (0..field.heights().len()).map(|slot| field.point(slot));
+            let mut points: Vec<_> = points.collect();
+            points.sort_by_key(|p| (std::cmp::Reverse(all.level(*p)), p[1], p[0]));
+            for point in points.repeat(3) {
+                let Some(height) = all.remove(point) else { continue };
+                let is_good = all.around(point).into_iter().flatten().all(|facet| {
+                    all.leaves(
+                        &facet,
+                        &mut |leaf| match criterion.error(&ground, leaf, tolerance) > tolerance {
+                            true => ControlFlow::Break(()),
+                            false => ControlFlow::Continue(()),
+                        },
+                    )
+                    .is_continue()
+                });
+                if !is_good {
+                    all.add(point, height);
+                }
+            }
+            assert!(
+                tried == all,
+                "{criterion:?}, seed {seed}, share {share}: {:?}, {:?}",
+                tried.points(),
+                all.points()
+            );
+        }
+    }
+}
+
+#[test]
 fn each_criterion_sees_its_own_fault() {
     // A plane has none but its slope; a bump has one.
     let plane: Vec<f64> = (0..SIDE * SIDE).map(|s| (s % SIDE * 20 + s / SIDE * 12) as f64).collect();
