@@ -78,9 +78,9 @@ clippy:
 tests:
 	@$(step) tests cargo test --locked --workspace --no-fail-fast -- --show-output
 
-# What takes too long for each change.
+# What takes too long for each change. Each DEM is told as it is done.
 test-long: setup
-	@$(step) long cargo test --locked -p diamantina-tests --test e2e -- --ignored --show-output
+	@$(step) long cargo test --locked -p diamantina-tests --test e2e -- --ignored --nocapture
 
 # After the tests, which have built the programs.
 contract:

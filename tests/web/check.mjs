@@ -16,8 +16,8 @@ const [width, height] = size.split('x').map(Number);
 const SIZE = { width, height };
 // On the ground, not far from the middle.
 const GROUND = [Math.round(width / 2), Math.round(2 * height / 3)];
-// Small pages are for those who want to know soon. In software each page takes a quarter of a minute before it shows anything,
-// so fewer are opened then.
+// Small pages are for those who want to know soon. In software each page takes seconds to show anything, so
+// fewer are opened then.
 const QUICK = width < 900;
 const ERROR_PIXELS = QUICK ? 4 : 2;
 // From the south-west, down into the hills.

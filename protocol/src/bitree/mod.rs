@@ -93,6 +93,19 @@ impl Facet {
     pub fn middle(&self) -> Point {
         middle(self.corners)
     }
+
+    /// The mean height of the hypotenuse's two ends.
+    fn mean(&self) -> f64 {
+        let [ha, _, hb] = self.heights;
+        (ha + hb) / 2.0
+    }
+
+    /// Its left or right half, if it is split at its middle `m`, which is so high.
+    fn half(&self, is_right: bool, m: Point, height: f64) -> Self {
+        let [ha, hc, hb] = self.heights;
+        let (path, corners) = split(self.path, self.corners, m)[usize::from(is_right)];
+        Self { path, corners, heights: if is_right { [hb, height, hc] } else { [hc, height, ha] } }
+    }
 }
 
 impl Bitree {
@@ -241,19 +254,11 @@ impl Bitree {
         let [lower, upper] = self.roots();
         let mut at = if place[0] > place[1] { lower } else { upper };
         for _ in 0..level {
-            let ([a, c, b], [ha, hc, hb]) = (at.corners, at.heights);
-            let m = at.middle();
-            let own = self.real[self.slot(m)];
-            let hm = if own.is_nan() { (ha + hb) / 2.0 } else { own };
+            let (m, height) = self.middle(&at);
             // Four times the grid's side at most, so products stay below 2^30.
-            let [mx, my, cx, cy] = [m[0], m[1], c[0], c[1]].map(u32::cast_signed);
+            let [[mx, my], [cx, cy]] = [m, at.corners[1]].map(|p| p.map(u32::cast_signed));
             let is_left = (mx - cx) * (place[1] - 4 * cy) > (my - cy) * (place[0] - 4 * cx);
-            // As in `halves`, but for one of them.
-            at = if is_left {
-                Facet { path: at.path << 1, corners: [c, m, a], heights: [hc, hm, ha] }
-            } else {
-                Facet { path: at.path << 1 | 1, corners: [b, m, c], heights: [hb, hm, hc] }
-            };
+            at = at.half(!is_left, m, height);
         }
         Some(at)
     }
@@ -290,16 +295,16 @@ impl Bitree {
     /// of level 2 k, which have no middle on the grid.
     #[must_use]
     pub fn halves(&self, facet: &Facet) -> [Facet; 2] {
-        let ([a, c, b], [ha, hc, hb]) = (facet.corners, facet.heights);
+        let (m, height) = self.middle(facet);
+        [false, true].map(|is_right| facet.half(is_right, m, height))
+    }
+
+    /// The middle of a triangle's hypotenuse, and how high it is if the triangle is split: its own height, or the mean of
+    /// the two ends.
+    fn middle(&self, facet: &Facet) -> (Point, f64) {
         let m = facet.middle();
         let own = self.real[self.slot(m)];
-        let hm = if own.is_nan() { (ha + hb) / 2.0 } else { own };
-        let heights = [[hc, hm, ha], [hb, hm, hc]];
-        let paths = [facet.path << 1, facet.path << 1 | 1];
-        [
-            Facet { path: paths[0], corners: [c, m, a], heights: heights[0] },
-            Facet { path: paths[1], corners: [b, m, c], heights: heights[1] },
-        ]
+        (m, if own.is_nan() { facet.mean() } else { own })
     }
 
     /// Whether there is a real point at its middle or strictly below.
@@ -330,10 +335,13 @@ impl Bitree {
         if self.below.get(from.path as usize).is_none_or(|count| *count <= 1) {
             return visit(from);
         }
-        let [ha, hc, hb] = from.heights;
-        let hm = (ha + hb) / 2.0;
-        for (half, heights) in self.halves(from).iter().zip([[hc, hm, ha], [hb, hm, hc]]) {
-            self.changes(half, heights, visit)?;
+        let (m, height) = self.middle(from);
+        for is_right in [false, true] {
+            self.changes(
+                &from.half(is_right, m, height),
+                from.half(is_right, m, from.mean()).heights,
+                visit,
+            )?;
         }
         ControlFlow::Continue(())
     }
@@ -387,8 +395,7 @@ impl Bitree {
             return Some(mean);
         }
         // An end is fictitious itself.
-        let [ha, _, hb] = self.around(point).into_iter().flatten().next()?.heights;
-        Some((ha + hb) / 2.0)
+        self.around(point).into_iter().flatten().next().map(|facet| facet.mean())
     }
 
     /// The height of a real point.

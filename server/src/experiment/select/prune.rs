@@ -109,22 +109,21 @@ struct Areas {
     log2: u8,
     /// By z: the cells of 2^z that are covered by squares of this and finer steps, and by those of this step alone.
     cells: Vec<[Vec<u64>; 2]>,
-    is_empty: bool,
 }
 
 impl Areas {
     fn new(log2: u8) -> Self {
         let words = |z: u8| (1usize << (2 * (log2 - z))).div_ceil(64);
         let cells = (0..=log2).map(|z| [vec![0; words(z)], vec![0; words(z)]]).collect();
-        Self { log2, cells, is_empty: true }
+        Self { log2, cells }
     }
 
     fn is_empty(&self) -> bool {
-        self.is_empty
+        // Every square lies in the one cell as large as the grid.
+        self.cells.last().is_none_or(|[upto, _]| upto.iter().all(|word| *word == 0))
     }
 
     fn insert(&mut self, point: Point) {
-        self.is_empty = false;
         let own = zeros(point);
         for z in own..=u32::from(self.log2) {
             for cell in cells(self.log2, point, own, z) {

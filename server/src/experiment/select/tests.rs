@@ -64,14 +64,13 @@ fn plainly(field: &Field, weights: Option<&[f32]>, tree: &Bitree) -> f64 {
     worst
 }
 
-/// Takes out each point and puts it back where something is wrong then, three times over all of them.
-fn prune_plainly(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, tree: &mut Bitree) {
-    let points = (0..ground.field().heights().len()).map(|slot| ground.field().point(slot));
-    let mut all: Vec<_> = points.collect();
+/// Takes out each point and puts it back where the selection is not good then, three times over all of them.
+fn prune_plainly(field: &Field, tree: &mut Bitree, is_good: impl Fn(&Bitree, [u32; 2]) -> bool) {
+    let mut all: Vec<_> = (0..field.heights().len()).map(|slot| field.point(slot)).collect();
     all.sort_by_key(|p| (std::cmp::Reverse(tree.level(*p)), p[1], p[0]));
     for point in all.repeat(3) {
         if let Some(height) = tree.remove(point)
-            && largest_error(ground, criterion, tree) > tolerance
+            && !is_good(tree, point)
         {
             tree.add(point, height);
         }
@@ -138,7 +137,7 @@ proptest! {
             let descended = top_down(&ground, criterion, tolerance, share);
             let [mut tried, mut all] = [descended.clone(), descended];
             prune(&ground, criterion, tolerance, &mut tried);
-            prune_plainly(&ground, criterion, tolerance, &mut all);
+            prune_plainly(&field, &mut all, |tree, _| largest_error(&ground, criterion, tree) <= tolerance);
             prop_assert!(tried == all, "{strategy}");
             prop_assert!(by_strategy(&ground, criterion, tolerance, strategy) == tried, "{strategy}");
         }
@@ -196,26 +195,16 @@ fn on_larger_fields_nothing_that_could_go_is_passed_over() {
             );
             let [mut tried, mut all] = [refined.clone(), refined];
             prune(&ground, criterion, tolerance, &mut tried);
-            // Every point in each of the passes, by what is drawn around it.
-            let points = (0..field.heights().len()).map(|slot| field.point(slot));
-            let mut points: Vec<_> = points.collect();
-            points.sort_by_key(|p| (std::cmp::Reverse(all.level(*p)), p[1], p[0]));
-            for point in points.repeat(3) {
-                let Some(height) = all.remove(point) else { continue };
-                let is_good = all.around(point).into_iter().flatten().all(|facet| {
-                    all.leaves(
-                        &facet,
-                        &mut |leaf| match criterion.error(&ground, leaf, tolerance) > tolerance {
-                            true => ControlFlow::Break(()),
-                            false => ControlFlow::Continue(()),
-                        },
-                    )
-                    .is_continue()
-                });
-                if !is_good {
-                    all.add(point, height);
-                }
-            }
+            prune_plainly(&field, &mut all, |tree, point| {
+                tree.around(point).into_iter().flatten().all(|facet| {
+                    let within = |error: f64| match error <= tolerance {
+                        true => ControlFlow::Continue(()),
+                        false => ControlFlow::Break(()),
+                    };
+                    let visit = &mut |leaf: &_| within(criterion.error(&ground, leaf, tolerance));
+                    tree.leaves(&facet, visit).is_continue()
+                })
+            });
             assert!(
                 tried == all,
                 "{criterion:?}, seed {seed}, share {share}: {:?}, {:?}",

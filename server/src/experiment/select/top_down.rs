@@ -50,7 +50,7 @@ pub(super) fn descend(
     // How many of a point's triangles are split for their own sake; a point is the middle of those of one level.
     let mut split_at = vec![0u8; field.heights().len()];
     let mut may_go = Vec::new();
-    // Kept from level to level: to have so much memory anew each time would take a third of all.
+    // Kept from level to level, since they are large.
     let (mut split, mut across) = (Vec::new(), Vec::new());
     for level in 0..finest {
         now.retain(|facet| {
