@@ -30,10 +30,10 @@ fn sources(names: &[&str]) -> Option<Vec<PathBuf>> {
     data().map(|folder| names.iter().map(|n| folder.join(n)).collect())
 }
 
-/// The number that a cell starts with.
+/// The number in a cell.
 fn number(table: &Table, row: &[String], column: &str) -> f64 {
     let i = table.columns.iter().position(|c| c == column).unwrap();
-    row[i].split(' ').next().unwrap().parse().unwrap()
+    row[i].parse().unwrap()
 }
 
 #[test]
@@ -178,4 +178,7 @@ fn a_mask_of_another_place_and_heights_beyond_all_measure_are_refused() {
         "a mask of elsewhere",
     );
     assert_failed(&run("{}/spike.tif"), 1, &["spike.tif", "1000000000", "262 km", "--nodata"], "a spike");
+    let ended = server(scratch.path(), "experiment tolerances {}/absent.tif -o {}/never");
+    assert_failed(&ended, 1, &["absent.tif"], "no DEM");
+    assert!(!scratch.path().join("never").exists(), "a folder with nothing in it");
 }

@@ -558,9 +558,13 @@ fn experiment(args: &ExperimentArgs, given: &clap::ArgMatches) -> Result<(), Fai
     experiment::refuse_ignored(&args.name, given).map_err(|e| Failure(2, e.to_string()))?;
     let progress = Arc::new(Progress::new());
     stop_on_signals(&progress)?;
-    experiment::report::prepare(&args.output)?;
+    let is_new = experiment::report::prepare(&args.output)?;
     let found = experiment::run(&args.name, &args.sources, &args.ingest, &args.options, &progress);
     progress.finish();
+    if found.is_err() && is_new {
+        // Without an effect where something is in it.
+        let _ = std::fs::remove_dir(&args.output);
+    }
     let report = found.map_err(|e| {
         let code = match e {
             ExperimentError::Unknown { .. } | ExperimentError::Options { .. } => 2,

@@ -27,6 +27,26 @@ impl Table {
         Self { name: name.to_owned(), caption: caption.to_owned(), columns, rows: Vec::new() }
     }
 
+    /// Adds for each name a column of means and one of their standard deviations, which [`Report::html`] writes as one.
+    pub fn add_means(&mut self, names: &[&str]) {
+        self.columns.extend(names.iter().flat_map(|name| [(*name).to_owned(), format!("{name}{SPREAD}")]));
+    }
+
+    /// A row of this table, or its columns, with means and spreads joined by `between`, or spreads left out.
+    fn joined(&self, cells: &[String], between: Option<&str>) -> Vec<String> {
+        let mut joined: Vec<String> = Vec::with_capacity(cells.len());
+        for (i, cell) in cells.iter().enumerate() {
+            let is_spread =
+                i > 0 && self.columns[i].strip_suffix(SPREAD) == Some(self.columns[i - 1].as_str());
+            match (joined.last_mut(), between) {
+                (Some(mean), Some(between)) if is_spread => *mean += &format!("{between}{cell}"),
+                (Some(_), None) if is_spread => {}
+                _ => joined.push(cell.clone()),
+            }
+        }
+        joined
+    }
+
     /// Adds a row.
     pub fn push(&mut self, cells: impl IntoIterator<Item = String>) {
         self.rows.push(cells.into_iter().collect());
@@ -46,7 +66,10 @@ impl Table {
     }
 }
 
-/// Cells with units, spreads or words stay text.
+/// What the name of a column of standard deviations ends with; that of their means stands before it.
+const SPREAD: &str = " sd";
+
+/// Cells with units or words stay text.
 fn numbers<S: Serializer>(rows: &[Vec<String>], serializer: S) -> Result<S::Ok, S::Error> {
     let value = |cell: &String| match cell.parse::<serde_json::Number>() {
         Ok(number) => serde_json::Value::Number(number),
@@ -67,13 +90,15 @@ pub struct Picture {
     pub bytes: Vec<u8>,
 }
 
-/// Makes a folder, if need be, and sees whether files can be made in it: before work whose results it is to hold.
+/// Makes a folder, if need be, and sees whether files can be made in it: before work whose results it is to hold. Returns
+/// whether it was made.
 ///
 /// # Errors
 /// When they cannot.
-pub fn prepare(folder: &Path) -> Result<(), ExperimentError> {
+pub fn prepare(folder: &Path) -> Result<bool, ExperimentError> {
+    let is_new = !folder.exists();
     let made = std::fs::create_dir_all(folder).and_then(|()| tempfile::tempfile_in(folder));
-    made.map(drop).map_err(|source| ExperimentError::Write { path: folder.to_owned(), source })
+    made.map(|_| is_new).map_err(|source| ExperimentError::Write { path: folder.to_owned(), source })
 }
 
 /// All that an experiment found.
@@ -152,10 +177,10 @@ impl Report {
                 "<div class=\"table\"><table><caption>{} (<a href=\"{1}.csv\">{1}.csv</a>)</caption><tr>{2}</tr>",
                 escaped(&table.caption),
                 escaped(&table.name),
-                cells(&table.columns, "th")
+                cells(&table.joined(&table.columns, None), "th")
             );
             for row in &table.rows {
-                let _ = writeln!(page, "<tr>{}</tr>", cells(row, "td"));
+                let _ = writeln!(page, "<tr>{}</tr>", cells(&table.joined(row, Some(" ± ")), "td"));
             }
             page.push_str("</table></div>\n");
         }
@@ -175,6 +200,23 @@ fn escaped(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn means_and_spreads_are_numbers_in_files_and_one_cell_on_a_page() {
+        let mut table = Table::new("t", "means", &["strategy"]);
+        table.add_means(&["points", "triangles"]);
+        table.push(["top-down", "7.5", "0.5", "12.0", "3.0"].map(str::to_owned));
+        assert_eq!(
+            table.csv(),
+            "strategy,points,points sd,triangles,triangles sd\ntop-down,7.5,0.5,12.0,3.0\n"
+        );
+        let json = serde_json::to_value(&table).unwrap();
+        assert_eq!(json["rows"], serde_json::json!([["top-down", 7.5, 0.5, 12.0, 3.0]]));
+        let report = Report { title: String::new(), notes: vec![], tables: vec![table], pictures: vec![] };
+        let page = report.html();
+        assert!(page.contains("<th>strategy</th><th>points</th><th>triangles</th></tr>"), "{page}");
+        assert!(page.contains("<td>top-down</td><td>7.5 ± 0.5</td><td>12.0 ± 3.0</td></tr>"), "{page}");
+    }
 
     #[test]
     fn tables_are_quoted_and_pages_escaped() {

@@ -249,10 +249,11 @@ fn numbers_table(run: &Run<'_>) -> Result<Table, ExperimentError> {
     Ok(table)
 }
 
+/// What tables of means have a row for.
+const FOR_EACH: [&str; 2] = ["tolerance [%]", "strategy"];
+
 fn means_table(run: &Run<'_>, found: &BTreeMap<(usize, Strategy), Vec<Outcome>>) -> Table {
-    let columns = [
-        "tolerance [%]",
-        "strategy",
+    let counted = [
         "BT added",
         "closed QT added",
         "closed QT mended",
@@ -265,26 +266,30 @@ fn means_table(run: &Run<'_>, found: &BTreeMap<(usize, Strategy), Vec<Outcome>>)
         "BT references",
         "closed QT references",
         "own QT references",
+    ];
+    let worst = [
         "largest BT error by the criterion [% of tolerance]",
         "largest QT error by the criterion [% of tolerance]",
     ];
-    let mut table = Table::new("means", "Means over all windows ± standard deviation", &columns);
+    let mut table = Table::new("means", "Means over all windows ± standard deviation (sd)", &FOR_EACH);
+    table.add_means(&counted);
+    table.columns.extend(worst.map(str::to_owned));
     for ((i, strategy), list) in found {
         let mean = |count: &dyn Fn(&Outcome) -> usize| {
-            let values: Vec<f64> = list.iter().map(|o| count(o) as f64).collect();
-            let [mean, spread] = mean_and_spread(&values);
-            format!("{mean:.1} ± {spread:.1}")
+            mean_and_spread(&list.iter().map(|o| count(o) as f64).collect::<Vec<_>>())
         };
         let percent = run.options.tolerances[*i];
         let worst = |meshes: &dyn Fn(&Outcome) -> f64| {
             let share = |o: &Outcome| if meshes(o) == 0.0 { 0.0 } else { 100.0 * meshes(o) / o.tolerance };
             format!("{:.1}", list.iter().map(share).fold(0.0, f64::max))
         };
-        let mut row = vec![percent.to_string(), strategy.to_string()];
-        row.extend([mean(&|o| o.bitree.added), mean(&|o| o.closed.added), mean(&|o| o.closed.mended)]);
+        let mut means =
+            vec![mean(&|o| o.bitree.added), mean(&|o| o.closed.added), mean(&|o| o.closed.mended)];
         for count in [|c: Counts| c.transmitted, |c: Counts| c.triangles, |c: Counts| c.references] {
-            row.extend([mean(&|o| count(o.bitree)), mean(&|o| count(o.closed)), mean(&|o| count(o.own))]);
+            means.extend([mean(&|o| count(o.bitree)), mean(&|o| count(o.closed)), mean(&|o| count(o.own))]);
         }
+        let mut row = vec![percent.to_string(), strategy.to_string()];
+        row.extend(means.as_flattened().iter().map(|number| format!("{number:.1}")));
         row.extend([worst(&|o| o.bitree.judged), worst(&|o| o.closed.judged.max(o.own.judged))]);
         table.push(row);
     }
@@ -309,9 +314,7 @@ fn savings(list: &[Outcome]) -> [[f64; 2]; 6] {
 }
 
 fn savings_table(run: &Run<'_>, found: &BTreeMap<(usize, Strategy), Vec<Outcome>>) -> Table {
-    let columns = [
-        "tolerance [%]",
-        "strategy",
+    let saved = [
         "points of closed",
         "triangles of closed",
         "references of closed",
@@ -320,10 +323,12 @@ fn savings_table(run: &Run<'_>, found: &BTreeMap<(usize, Strategy), Vec<Outcome>
         "references of own",
     ];
     let caption =
-        "What the bitree saves, percent of the quadtree's: mean of the windows ± standard deviation";
-    let mut table = Table::new("savings", caption, &columns);
+        "What the bitree saves, percent of the quadtree's: mean of the windows ± standard deviation (sd)";
+    let mut table = Table::new("savings", caption, &FOR_EACH);
+    table.add_means(&saved);
     for ((i, strategy), list) in found {
-        let cells = savings(list).map(|[mean, spread]| format!("{mean:.1} ± {spread:.1}"));
+        let savings = savings(list);
+        let cells = savings.as_flattened().iter().map(|number| format!("{number:.1}"));
         table.push([run.options.tolerances[*i].to_string(), strategy.to_string()].into_iter().chain(cells));
     }
     table
