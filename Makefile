@@ -1,8 +1,11 @@
-# Each target does its own set-up (scripts/setup says what it installs). Steps run one after another.
+# Each target does its own set-up (scripts/setup says what it installs). Steps run one after another, but those of
+# `after-tests`, some of which leave most cores idle.
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
+ifndef SIDE_BY_SIDE
 .NOTPARALLEL:
-.PHONY: help demo test test-long check contract objects bench bench-flight bench-link bench-peers bench-serve bench-users bench-wasm setup fmt clippy tests doc deny wasm web web-test scripts
+endif
+.PHONY: help demo test test-long check after-tests contract objects bench bench-flight bench-link bench-peers bench-serve bench-users bench-wasm setup fmt clippy tests doc deny wasm web web-quick web-test scripts
 
 # Mesa's device selection complains where there is no desktop session; there is nothing to select.
 export NODEVICE_SELECT := 1
@@ -30,7 +33,11 @@ demo:
 	@$(step) build cargo build --locked --release -p diamantina-server -p diamantina-client
 	$(target)/release/diamantina-server demo
 
-test: setup fmt clippy tests contract objects doc deny wasm web-test scripts
+test: setup fmt clippy tests
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target SIDE_BY_SIDE=yes after-tests
+	@$(step) web-test scripts/web-test
+
+after-tests: web-quick contract objects doc deny wasm scripts
 
 check: fmt clippy
 
@@ -82,11 +89,10 @@ tests:
 test-long: setup
 	@$(step) long cargo test --locked -p diamantina-tests --test e2e -- --ignored --nocapture
 
-# After the tests, which have built the programs.
+# This and the next after the tests, which have built the programs.
 contract:
 	@$(step) contract scripts/contract
 
-# The same, with an object store.
 objects:
 	@$(step) objects scripts/objects
 
@@ -102,6 +108,10 @@ wasm:
 web:
 	@$(step) setup scripts/setup web
 	@$(step) web scripts/web
+
+# What web-test builds, where it can be built.
+web-quick:
+	@$(step) web-quick scripts/web-test --build
 
 web-test: setup
 	@$(step) web-test scripts/web-test

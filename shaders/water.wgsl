@@ -21,8 +21,10 @@ struct Water {
 @group(2) @binding(1) var smooth_sampler: sampler;
 @group(2) @binding(2) var mirrored: texture_2d<f32>;
 @group(2) @binding(3) var scene: texture_2d<f32>;
-// The depth of `scene`, reversed: the near plane's distance over the distance forward.
+// The depth of `scene`, reversed: the near plane's distance over the distance forward. Read through a sampler: without one
+// WebGL2 takes its default, which a texture of depths must not be mixed by, and reads 0.
 @group(2) @binding(4) var scene_depth: texture_2d<f32>;
+@group(2) @binding(5) var exact_sampler: sampler;
 
 // Where on the screen a direction or a place, relative to the eye, is seen: x and y from 0 to 1 down and to the right,
 // and whether it is ahead at all.
@@ -47,9 +49,7 @@ fn wave_slope(across: vec2<f32>, pixel: f32) -> vec2<f32> {
 // Metres from the eye to what the scene without water shows at a place of the screen, along a ray that goes `forward`
 // metres ahead a metre; a great many where that is the sky.
 fn scene_distance(place: vec2<f32>, forward: f32) -> f32 {
-    let size = vec2<i32>(textureDimensions(scene_depth));
-    let pixel = clamp(vec2<i32>(place * vec2<f32>(size)), vec2<i32>(0), size - 1);
-    let depth = textureLoad(scene_depth, pixel, 0).x;
+    let depth = textureSampleLevel(scene_depth, exact_sampler, place, 0.0).x;
     return water.optics.z / max(depth, 1e-20) / forward;
 }
 

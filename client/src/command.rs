@@ -295,13 +295,8 @@ impl ViewArgs {
         render::Options { budget_bytes: self.gpu_memory, ..self.look.options() }
     }
 
-    /// `blocks_by_default`: whether imagery is kept in blocks unless something else is asked for.
-    fn open(
-        &self,
-        morph_seconds: f64,
-        disk: Option<&Disk>,
-        blocks_by_default: bool,
-    ) -> Result<Terrain, Failure> {
+    /// `in_window`: imagery is kept in blocks unless something else is asked for, and another version of the scene is looked for.
+    fn open(&self, morph_seconds: f64, disk: Option<&Disk>, in_window: bool) -> Result<Terrain, Failure> {
         if !(self.error_pixels.is_finite() && self.error_pixels > 0.0) {
             return Err(Failure(
                 2,
@@ -334,6 +329,7 @@ impl ViewArgs {
                 token: self.token.token.as_deref().map(Into::into),
                 disk: disk.cloned(),
                 offline: self.keep.is_offline(),
+                follow: in_window.then_some(viewer::FOLLOW),
                 ..fetch::Options::default()
             },
             layers: self.layers.clone(),
@@ -347,7 +343,7 @@ impl ViewArgs {
             texture_bytes: usize::try_from(self.texture_memory).unwrap_or(usize::MAX),
             texture_coding: Coding::blocks_if(match self.texture_compression {
                 Some(asked) => asked == Switch::On,
-                None => blocks_by_default && !self.look.is_true,
+                None => in_window && !self.look.is_true,
             }),
             fade_seconds: if morph_seconds > 0.0 { FADE_SECONDS.min(morph_seconds) } else { 0.0 },
             ..terrain::Options::default()

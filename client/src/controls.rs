@@ -68,11 +68,10 @@ impl Controls {
         self.camera.size = size.map(|s| s.max(1));
     }
 
-    /// Stretches the camera's heights, as the terrain's are.
-    pub fn stretch(&mut self, by: f64) {
+    /// Lifts the camera, as the terrain below it is.
+    pub fn lift(&mut self, by: f64) {
         self.glide = None;
-        self.camera.eye.z *= by;
-        self.camera.target.z *= by;
+        self.shift(DVec3::Z * by);
     }
 
     /// Whether the camera is on its way.

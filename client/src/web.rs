@@ -125,7 +125,12 @@ fn options(address: &Address, token: Option<String>) -> Result<terrain::Options,
         zone: address.asked("zone"),
         time: viewer::time_at(&address.view).unwrap_or(0.0),
         imagery: Imagery::asked(address.asked("texture")),
-        fetch: fetch::Options { encoding, token: token.map(Into::into), ..fetch::Options::default() },
+        fetch: fetch::Options {
+            encoding,
+            token: token.map(Into::into),
+            follow: Some(viewer::FOLLOW),
+            ..fetch::Options::default()
+        },
         ..terrain::Options::default()
     })
 }

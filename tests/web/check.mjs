@@ -151,6 +151,32 @@ async function heights(page, reference, blank, graphics) {
     await page.waitForFunction(() => window.diamantina.state().view.startsWith('2500.00,500.00,2600.00,25.000,32.000'),
         null, { timeout: PATIENCE });
 
+    // Two fingers that part go nearer to what is between them, which stays where it is.
+    const far = (await settled(page)).view.split(',').map(Number);
+    const fingers = await page.context().newCDPSession(page);
+    const touch = (type, apart) => fingers.send('Input.dispatchTouchEvent', {
+        type,
+        touchPoints: apart === null ? [] : [-apart, apart].map((by, id) => ({ x: GROUND[0] + by, y: GROUND[1], id })),
+    });
+    await touch('touchStart', 20);
+    for (let apart = 20; apart <= 60; apart += 8) {
+        await touch('touchMove', apart);
+        await frames(page, 1);
+    }
+    await touch('touchEnd', null);
+    const near = (await settled(page)).view.split(',').map(Number);
+    check(near[2] < 0.8 * far[2], `two fingers go from ${far} to ${near}`);
+    check(Math.abs(near[3] - far[3]) < 5, `two fingers that only part turn from ${far} to ${near}`);
+
+    // The panel's first slider: more error, fewer triangles.
+    const { triangles } = await state(page);
+    await page.keyboard.press('Tab');
+    await frames(page, 3);
+    await page.mouse.click(SIZE.width - 165, 152);
+    await page.waitForFunction(
+        (before) => window.diamantina.state().asked_error_pixels > 20 && window.diamantina.state().triangles < before / 2,
+        triangles, { timeout: PATIENCE });
+
     const last = await state(page);
     return `${mean.toFixed(2)} from the client's picture, longest frame ${last.longest_frame_milliseconds.toFixed(0)} ms`;
 }

@@ -195,6 +195,18 @@ impl Http {
         Err(refusal(route, &response))
     }
 
+    /// The ETag of an answer, if it has one, without its body.
+    pub(super) async fn tag(&self, route: &str) -> Result<Option<String>, FetchError> {
+        count(&self.traffic.requests, 1);
+        let sent = self.client.head(format!("{}{route}", self.base)).send();
+        let response = self.in_time(sent).await?;
+        if response.status() == StatusCode::OK {
+            let tag = response.headers().get(reqwest::header::ETAG);
+            return Ok(tag.and_then(|tag| tag.to_str().ok()).map(str::to_owned));
+        }
+        Err(refusal(route, &response))
+    }
+
     async fn in_time<T>(&self, coming: impl Future<Output = reqwest::Result<T>>) -> Result<T, FetchError> {
         match within(self.patience, coming).await {
             Some(come) => come.map_err(|e| transport(&e)),

@@ -93,13 +93,16 @@ pub struct Options {
     pub disk: Option<Disk>,
     /// Ask the disk alone, and never the network.
     pub offline: bool,
+    /// How often to ask whether the scene has another version, where nothing else is asked for that would tell. `None`: never.
+    pub follow: Option<Duration>,
 }
 
 impl Default for Options {
     fn default() -> Self {
         let encoding = Encoding::default();
         let (disk, offline) = (None, false);
-        Self { requests_max: 8, patience: Duration::from_secs(15), encoding, token: None, disk, offline }
+        let patience = Duration::from_secs(15);
+        Self { requests_max: 8, patience, encoding, token: None, disk, offline, follow: None }
     }
 }
 
@@ -261,6 +264,9 @@ impl Fetcher {
         }
         if is_watched {
             background.spawn(kept::watch(Arc::clone(&shared)));
+        }
+        if let Some(pause) = options.follow.filter(|_| !offline) {
+            background.spawn(tasks::follow(Arc::clone(&shared), pause));
         }
         Ok((Self { shared, events, seen: 0, background }, scene))
     }

@@ -5,7 +5,7 @@ use super::http::{Http, PAGE_BYTES_MAX, count, decode_page, good_payload, pause,
 use super::stream::weight;
 use super::unpack::unpack;
 use super::{Event, FetchError, Key, REST, TRIES_MAX, Want};
-use crate::background::within;
+use crate::background::{sleep, within};
 use crate::disk::Shelf;
 use crate::encoding::Encoding;
 use bytes::Bytes;
@@ -17,6 +17,7 @@ use foldhash::fast::RandomState;
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
+use std::time::Duration;
 use tokio::sync::Notify;
 use web_time::Instant;
 
@@ -117,6 +118,31 @@ impl State {
     fn rests(&self, layer: usize) -> bool {
         let flies = |flight: &Flight| flight.stream == Some(layer);
         self.streams.iter().any(|(l, _)| *l == layer) || self.flights.values().any(flies)
+    }
+}
+
+/// Looks every now and then whether the scene has another version, until it has: whoever has all of this one asks for nothing
+/// that would tell.
+pub(super) async fn follow(shared: Arc<Shared>, pause: Duration) {
+    let route = message::scene_route(&shared.scene.name);
+    let mut known = None;
+    while !shared.lock().stopped {
+        sleep(pause).await;
+        if shared.lock().away.is_some() {
+            continue;
+        }
+        let gone = match shared.http.tag(&route).await {
+            Ok(tag) if tag.is_some() && tag == known => continue,
+            Ok(tag) => {
+                known = tag;
+                false
+            }
+            Err(FetchError::Status { status: 404 | 410, .. }) => true,
+            Err(_) => continue,
+        };
+        if gone || shared.is_replaced().await {
+            shared.stop();
+        }
     }
 }
 
@@ -459,6 +485,7 @@ impl Shared {
         }
     }
 
+    /// Ends: the scene has another version.
     pub(super) fn stop(&self) {
         let mut state = self.lock();
         if !state.stopped {

@@ -126,7 +126,8 @@ struct Mirror {
 /// All that water takes, made when it is first seen.
 pub(super) struct WaterPasses {
     layout: wgpu::BindGroupLayout,
-    sampler: wgpu::Sampler,
+    smooth_sampler: wgpu::Sampler,
+    exact_sampler: wgpu::Sampler,
     /// To the picture.
     surfaces: Pipelines,
     /// To the textures: what is mirrored, what is seen through, and the sky.
@@ -152,6 +153,12 @@ impl WaterPasses {
             },
             count: None,
         };
+        let sampler = |binding, kind| wgpu::BindGroupLayoutEntry {
+            binding,
+            visibility: wgpu::ShaderStages::FRAGMENT,
+            ty: wgpu::BindingType::Sampler(kind),
+            count: None,
+        };
         let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
             label: Some("water"),
             entries: &[
@@ -165,23 +172,21 @@ impl WaterPasses {
                     },
                     count: None,
                 },
-                wgpu::BindGroupLayoutEntry {
-                    binding: 1,
-                    visibility: wgpu::ShaderStages::FRAGMENT,
-                    ty: wgpu::BindingType::Sampler(wgpu::SamplerBindingType::Filtering),
-                    count: None,
-                },
+                sampler(1, wgpu::SamplerBindingType::Filtering),
                 texture(2, true),
                 texture(3, true),
                 texture(4, false),
+                sampler(5, wgpu::SamplerBindingType::NonFiltering),
             ],
         });
-        let sampler = device.create_sampler(&wgpu::SamplerDescriptor {
-            label: Some("water"),
-            mag_filter: wgpu::FilterMode::Linear,
-            min_filter: wgpu::FilterMode::Linear,
-            ..Default::default()
-        });
+        let sampler = |filter| {
+            device.create_sampler(&wgpu::SamplerDescriptor {
+                label: Some("water"),
+                mag_filter: filter,
+                min_filter: filter,
+                ..Default::default()
+            })
+        };
         let [frame, layer] = &renderer.groups;
         let terrain = |mode| terrain_pipelines(device, TARGET, &renderer.terrain_groups(), mode);
         Self {
@@ -193,7 +198,8 @@ impl WaterPasses {
             scene_lens: Lens::new(device, &renderer.groups),
             mirrors: BTreeMap::new(),
             layout,
-            sampler,
+            smooth_sampler: sampler(wgpu::FilterMode::Linear),
+            exact_sampler: sampler(wgpu::FilterMode::Nearest),
         }
     }
 
@@ -307,15 +313,20 @@ impl WaterPasses {
             binding,
             resource: wgpu::BindingResource::TextureView(view),
         };
+        let sampler = |binding, sampler| wgpu::BindGroupEntry {
+            binding,
+            resource: wgpu::BindingResource::Sampler(sampler),
+        };
         let group = device.create_bind_group(&wgpu::BindGroupDescriptor {
             label: Some("water"),
             layout: &self.layout,
             entries: &[
                 wgpu::BindGroupEntry { binding: 0, resource: uniform.as_entire_binding() },
-                wgpu::BindGroupEntry { binding: 1, resource: wgpu::BindingResource::Sampler(&self.sampler) },
+                sampler(1, &self.smooth_sampler),
                 view(2, &sheet.colour),
                 view(3, &self.scene.colour),
                 view(4, &self.scene.depth),
+                sampler(5, &self.exact_sampler),
             ],
         });
         Mirror { lens: Lens::new(device, &renderer.groups), sheet, uniform, group }

@@ -18,6 +18,8 @@ pub(super) fn show(viewer: &Viewer, ui: &Ui) {
     let camera = viewer.camera();
     let scale = f64::from(ui.ctx().pixels_per_point());
     let planes = camera.planes();
+    // Not over the panel.
+    let painter = ui.painter().with_clip_rect(ui.available_rect_before_wrap());
     for item in viewer.items() {
         let Some(layer) = viewer.terrain.scene().layers.get(item.layer) else { continue };
         let Some(bounds) = bounds(layer, &item) else { continue };
@@ -30,7 +32,7 @@ pub(super) fn show(viewer: &Viewer, ui: &Ui) {
             if let Some(line) = seen(camera, edge) {
                 #[allow(clippy::cast_possible_truncation, reason = "for a line")]
                 let points = line.map(|p| Pos2::new((p.x / scale) as f32, (p.y / scale) as f32));
-                ui.painter().line_segment(points, stroke);
+                painter.line_segment(points, stroke);
             }
         }
     }
@@ -62,7 +64,7 @@ fn edges(bounds: &Bounds) -> impl Iterator<Item = [DVec3; 2]> {
 }
 
 /// The part of a line that is ahead of the eye, in pixels.
-fn seen(camera: &Camera, line: [DVec3; 2]) -> Option<[DVec2; 2]> {
+pub(super) fn seen(camera: &Camera, line: [DVec3; 2]) -> Option<[DVec2; 2]> {
     let [right, up, backward] = camera.axes();
     let [width, height] = camera.size.map(f64::from);
     let focal = camera.pixels_per_radian();

@@ -5,7 +5,7 @@ use crate::render::{self, Overlay, RenderError, Renderer};
 use std::sync::Arc;
 use std::time::Duration;
 use winit::dpi::PhysicalSize;
-use winit::event::WindowEvent;
+use winit::event::{DeviceId, Touch, WindowEvent};
 use winit::window::Window;
 
 /// Between frames while nothing happens: what arrives is drawn within it.
@@ -99,6 +99,15 @@ impl Display {
 
     /// Takes in an event of the window.
     pub(crate) fn take(&mut self, event: &WindowEvent) {
+        // In browsers winit takes each finger for a device of its own, and to egui two fingers are a gesture on one alone.
+        let one_device;
+        let event = match event {
+            WindowEvent::Touch(touch) => {
+                one_device = WindowEvent::Touch(Touch { device_id: DeviceId::dummy(), ..*touch });
+                &one_device
+            }
+            other => other,
+        };
         if let WindowEvent::Resized(size) = event {
             self.resize(*size);
         }

@@ -1,7 +1,8 @@
 //! What was clicked: places on the ground, and the profile between the last two.
 
 use super::Viewer;
-use egui::{Align2, FontId, RichText, Stroke, Ui};
+use super::boxes::seen;
+use egui::{Align2, Color32, FontId, RichText, Stroke, Ui};
 use glam::DVec3;
 
 /// Places of a profile.
@@ -76,16 +77,68 @@ pub(super) fn follow(viewer: &mut Viewer) {
     viewer.profile = Profile { ends, heights, is_final: viewer.frame.complete, age: 0 };
 }
 
+/// Digits after the point of metres in a scene with such cells: a hundredth of one is told.
+fn decimals(cell: f64) -> usize {
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "from 1 to 6")]
+    let digits = (2.0 - cell.max(1e-9).log10()).floor().clamp(1.0, 6.0) as usize;
+    digits
+}
+
+/// Metres with so many digits after the point, and no minus before a zero.
+fn metres(value: f64, digits: usize) -> String {
+    let text = format!("{value:.digits$}");
+    match text.strip_prefix('-') {
+        Some(zero) if !zero.contains(|c: char| c.is_ascii_digit() && c != '0') => zero.to_owned(),
+        _ => text,
+    }
+}
+
+/// Where marks lie in the picture, and the ground between them.
+pub(super) fn show_places(viewer: &Viewer, ui: &Ui) {
+    let camera = viewer.camera();
+    let scale = f64::from(ui.ctx().pixels_per_point());
+    let painter = ui.painter().with_clip_rect(ui.available_rect_before_wrap());
+    let drawn = |place: DVec3| place.with_z(place.z * viewer.look.exaggeration);
+    let points = |line: [DVec3; 2]| {
+        #[allow(clippy::cast_possible_truncation, reason = "for a line")]
+        let point = |p: glam::DVec2| egui::pos2((p.x / scale) as f32, (p.y / scale) as f32);
+        Some(seen(camera, line.map(drawn))?.map(point))
+    };
+    let (light, dark) = (Color32::from_rgb(255, 240, 120), Color32::from_black_alpha(160));
+    if let Some([first, last]) = viewer.profile.ends {
+        let steps = (viewer.profile.heights.len().max(2) - 1) as f64;
+        let places = viewer.profile.heights.iter().enumerate();
+        let places: Vec<Option<DVec3>> =
+            places.map(|(i, height)| Some(first.lerp(last, i as f64 / steps).with_z((*height)?))).collect();
+        for stroke in [Stroke::new(4.0, dark), Stroke::new(2.0, light)] {
+            for pair in places.windows(2) {
+                if let [Some(a), Some(b)] = *pair
+                    && let Some(line) = points([a, b])
+                {
+                    painter.line_segment(line, stroke);
+                }
+            }
+        }
+    }
+    for mark in viewer.marks() {
+        if let Some([at, _]) = points([mark.place; 2]) {
+            painter.circle(at, 5.0, light, Stroke::new(2.0, dark));
+        }
+    }
+}
+
 /// What was clicked, in the panel.
 pub(super) fn show(viewer: &Viewer, ui: &mut Ui) {
+    let digits = decimals(viewer.cell());
+    let metres = |value: f64| metres(value, digits);
     let row = |ui: &mut Ui, mark: &Mark| {
-        let error = mark.error.map_or(String::new(), |error| format!(" ± {error:.1}"));
-        ui.monospace(format!("{:.1}, {:.1}", mark.place.x, mark.place.y));
+        let error = mark.error.map_or(String::new(), |error| format!(" ± {}", metres(error)));
+        ui.monospace(format!("{}, {}", metres(mark.place.x), metres(mark.place.y)));
         if let Some([lon, lat]) = mark.lonlat {
             ui.monospace(degrees(lon, lat));
         }
         let layer = &viewer.terrain.scene().layers[mark.layer].name;
-        ui.monospace(format!("height {:.1}{error} m, {layer}", mark.place.z));
+        ui.monospace(format!("height {}{error} m, {layer}", metres(mark.place.z)));
     };
     match viewer.marks() {
         [] => {
@@ -96,9 +149,10 @@ pub(super) fn show(viewer: &Viewer, ui: &mut Ui) {
             row(ui, first);
             row(ui, last);
             let by = last.place - first.place;
-            ui.monospace(format!("{:.1} m apart on the level, {:+.1} m up", by.truncate().length(), by.z));
-            ui.monospace(format!("{:.1} m over the ground", viewer.profile.length()));
-            plot(&viewer.profile, ui);
+            let (apart, way) = (metres(by.truncate().length()), if by.z < 0.0 { "down" } else { "up" });
+            ui.monospace(format!("{apart} m apart on the level, {} m {way}", metres(by.z.abs())));
+            ui.monospace(format!("{} m over the ground", metres(viewer.profile.length())));
+            plot(&viewer.profile, digits, ui);
         }
     }
 }
@@ -110,7 +164,7 @@ fn degrees(lon: f64, lat: f64) -> String {
 }
 
 /// The profile, from the first mark at the left to the last.
-fn plot(profile: &Profile, ui: &mut Ui) {
+fn plot(profile: &Profile, digits: usize, ui: &mut Ui) {
     let size = egui::vec2(ui.available_width(), 90.0);
     let (rect, response) = ui.allocate_exact_size(size, egui::Sense::hover());
     let painter = ui.painter_at(rect);
@@ -138,8 +192,8 @@ fn plot(profile: &Profile, ui: &mut Ui) {
         let place = align.pos_in_rect(&rect.shrink2(egui::vec2(4.0, 1.0)));
         painter.text(place, align, text, font.clone(), colour);
     };
-    corner(Align2::LEFT_TOP, format!("{high:.1} m"));
-    corner(Align2::LEFT_BOTTOM, format!("{low:.1} m"));
+    corner(Align2::LEFT_TOP, format!("{} m", metres(high, digits)));
+    corner(Align2::LEFT_BOTTOM, format!("{} m", metres(low, digits)));
     if let (Some(pointer), Some([first, last])) = (response.hover_pos(), profile.ends) {
         let part = f64::from(((pointer.x - rect.left()) / rect.width()).clamp(0.0, 1.0));
         #[allow(
@@ -151,7 +205,8 @@ fn plot(profile: &Profile, ui: &mut Ui) {
         if let Some(Some(height)) = profile.heights.get(i) {
             painter.circle_filled(at(i, *height), 3.0, ui.visuals().strong_text_color());
             let along = (last - first).truncate().length() * part;
-            corner(Align2::RIGHT_TOP, format!("{height:.1} m after {along:.0} m"));
+            let along = metres(along, digits - 1);
+            corner(Align2::RIGHT_TOP, format!("{} m after {along} m", metres(*height, digits)));
         }
     }
 }
@@ -159,6 +214,17 @@ fn plot(profile: &Profile, ui: &mut Ui) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn metres_have_the_digits_that_cells_of_a_size_need() {
+        let of = |value: f64, cell: f64| metres(value, decimals(cell));
+        assert_eq!(
+            [of(1234.56, 90.0), of(1234.567, 1.0), of(0.01234, 0.014)],
+            ["1234.6", "1234.57", "0.012"]
+        );
+        assert_eq!([of(-0.04, 90.0), of(-0.05001, 90.0), of(-10.0, 90.0)], ["0.0", "-0.1", "-10.0"]);
+    }
+
     #[test]
     fn degrees_are_written_as_on_maps() {
         assert_eq!(degrees(-9.5, -45.25), "45.250000° S, 9.500000° W");

@@ -43,12 +43,13 @@ use crate::render::{FrameStats, Look};
 use crate::terrain::{FrameView, Terrain};
 use crate::texture::Drape;
 use bookmarks::Bookmarks;
-use diamantina_protocol::message::Kind;
+use diamantina_protocol::message::{Kind, Scene};
 use egui::{Event, Key, Modifiers, Painter, PointerButton, Rect, Sense, Ui};
 use glam::{DVec2, DVec3};
 use measure::Profile;
 use panel::History;
 use std::path::PathBuf;
+use std::time::Duration;
 use truth::Untrue;
 
 /// Radians that the view turns for a point (of 1/96 inch, about) of a drag.
@@ -66,11 +67,20 @@ const CLEARANCE_CELLS: f64 = 0.5;
 /// ... and the least distance to what it zooms to.
 const NEAREST_CELLS: f64 = 3.0;
 
+/// How often a scene that is looked at is compared with the server's.
+pub const FOLLOW: Duration = Duration::from_secs(10);
+
 /// Seconds that points move, where nothing else was asked for.
 const MORPH_SECONDS: f64 = 0.3;
 
 /// Points at the window's lower side that messages take.
 const MESSAGE_POINTS: f32 = 26.0;
+
+/// Seconds that a message stays.
+const MESSAGE_SECONDS: f64 = 8.0;
+
+/// The longest step of what moves the eye, in seconds: after a frame that took longer it is not far away at once.
+const STEP_SECONDS: f64 = 0.1;
 
 /// What whoever shows the viewer is asked to do.
 #[derive(Debug, Clone, PartialEq)]
@@ -85,13 +95,20 @@ pub enum Ask {
     Quit,
 }
 
+/// What became of something, and how many more seconds it is told.
+struct Message {
+    text: String,
+    seconds: f64,
+}
+
 /// The viewer of a scene.
 pub struct Viewer {
     terrain: Terrain,
     /// The scene's address.
     url: String,
     controls: Controls,
-    home: Camera,
+    /// Whether it has yet to go where it begins, once it is known how much of the picture the panel covers.
+    begins: bool,
     picker: Picker,
     look: Look,
     /// What is beautiful and not shown, while nothing but what was measured is.
@@ -107,11 +124,15 @@ pub struct Viewer {
     globe: Option<Globe>,
     bookmarks: Bookmarks,
     panel_is_open: bool,
+    /// Pixels of the picture's width that the panel covers.
+    covered: u32,
     shows_boxes: bool,
     history: History,
     player: Player,
     drawn: FrameStats,
-    message: Option<String>,
+    /// Whether the last frame asked for this one: then the time between them is what a frame takes.
+    goes_on: bool,
+    message: Option<Message>,
     asks: Vec<Ask>,
 }
 
@@ -126,7 +147,7 @@ impl Viewer {
         let time = terrain.time();
         Self {
             controls: Controls::new(stretched(camera.unwrap_or(home))),
-            home: stretched(home),
+            begins: camera.is_none(),
             terrain,
             url: url.to_owned(),
             picker: Picker::default(),
@@ -140,10 +161,12 @@ impl Viewer {
             globe,
             bookmarks: Bookmarks::default(),
             panel_is_open: true,
+            covered: 0,
             shows_boxes: false,
             history: History::default(),
             player: Player::at(time),
             drawn: FrameStats::default(),
+            goes_on: false,
             message: None,
             asks: Vec::new(),
         }
@@ -216,7 +239,7 @@ impl Viewer {
 
     /// Says what became of something.
     pub fn tell(&mut self, message: impl Into<String>) {
-        self.message = Some(message.into());
+        self.message = Some(Message { text: message.into(), seconds: MESSAGE_SECONDS });
     }
 
     /// Takes in what a frame cost.
@@ -227,7 +250,6 @@ impl Viewer {
     /// The picture's size in pixels.
     pub fn resize(&mut self, size: [u32; 2]) {
         self.controls.resize(size);
-        self.home.size = self.camera().size;
     }
 
     /// The scene's address with the view: `URL#x,y,z,heading,pitch`, metres and degrees; with a comma and seconds behind
@@ -241,8 +263,11 @@ impl Viewer {
     #[must_use]
     pub fn view(&self) -> String {
         let eye = self.camera().eye;
+        // As they are where heights are not multiplied.
         let z = eye.z / self.look.exaggeration;
-        let [heading, pitch] = [self.controls.heading(), self.controls.pitch()].map(f64::to_degrees);
+        let (down, ahead) = self.controls.pitch().sin_cos();
+        let pitch = (down / self.look.exaggeration).atan2(ahead).to_degrees();
+        let heading = self.controls.heading().to_degrees();
         let heading = heading.rem_euclid(360.0);
         let time = if self.terrain.scene().series.is_empty() {
             String::new()
@@ -271,13 +296,23 @@ impl Viewer {
 
     /// The same; without the panel and all that is no part of a picture, where one is taken.
     pub(crate) fn frame_of(&mut self, ui: &mut Ui, with_panel: bool) {
-        let seconds = f64::from(ui.input(|input| input.stable_dt)).min(0.1);
+        // After a rest nobody knows when the first frame of a movement should have been.
+        let [since, usual] = ui.input(|input| [input.unstable_dt, input.stable_dt].map(f64::from));
+        let seconds = if self.goes_on { since } else { usual.min(STEP_SECONDS) };
         if with_panel {
+            let width = ui.available_rect_before_wrap().width();
             panel::show(self, ui);
+            let covered = width - ui.available_rect_before_wrap().width();
+            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a part of a width")]
+            let covered = (covered * ui.ctx().pixels_per_point()).max(0.0) as u32;
+            self.covered = covered;
+        }
+        if std::mem::take(&mut self.begins) {
+            self.controls = Controls::new(self.whole(&self.terrain.shown_scene()));
         }
         self.switch_panel(ui);
-        self.steer(ui, seconds);
-        self.controls.step(seconds);
+        self.steer(ui, seconds.min(STEP_SECONDS));
+        self.controls.step(seconds.min(STEP_SECONDS));
         let eye = self.camera().eye;
         let ground = self.picker.ground(
             &self.terrain.scene().layers,
@@ -301,20 +336,37 @@ impl Viewer {
             }
         }
         measure::follow(self);
-        if self.shows_boxes && with_panel {
-            boxes::show(self, ui);
+        if with_panel {
+            if self.shows_boxes {
+                boxes::show(self, ui);
+            }
+            measure::show_places(self, ui);
         }
         // Above the message at the lower left, beside the panel.
         let mut area = ui.available_rect_before_wrap();
         area.max.y -= if with_panel { MESSAGE_POINTS } else { 0.0 };
         self.annotate(ui.painter(), area);
-        self.history.note(seconds, &self.frame);
+        self.history.note(self.goes_on.then_some(seconds), &self.frame);
+        self.age_message(ui, seconds);
         let has_waves = self.has_waves();
         if has_waves {
             self.look.water.seconds += seconds;
         }
         let is_moving = self.frame.moving > 0 || self.controls.is_gliding() || has_waves || self.player.plays;
-        if !self.frame.complete || is_moving {
+        self.goes_on = !self.frame.complete || is_moving;
+        if self.goes_on {
+            ui.ctx().request_repaint();
+        }
+    }
+
+    /// A message that is old goes.
+    fn age_message(&mut self, ui: &Ui, seconds: f64) {
+        let Some(message) = &mut self.message else { return };
+        message.seconds -= seconds;
+        if message.seconds > 0.0 {
+            ui.ctx().request_repaint_after(Duration::from_secs_f64(message.seconds));
+        } else {
+            self.message = None;
             ui.ctx().request_repaint();
         }
     }
@@ -515,24 +567,35 @@ impl Viewer {
         }
     }
 
-    /// Flies to where the viewer began.
+    /// Flies to where all of the scene is seen, as where the viewer begins.
     fn go_home(&mut self) {
-        self.controls.glide_to(self.home);
+        self.controls.glide_to(self.whole(self.terrain.scene()));
+    }
+
+    /// The camera that sees all of a scene beside the panel.
+    fn whole(&self, scene: &Scene) -> Camera {
+        let size = self.camera().size;
+        // In a window that is hardly wider than the panel, under it.
+        let covered = if 2 * self.covered > size[0] { 0 } else { self.covered };
+        let exaggeration = self.look.exaggeration;
+        let free = overview::stretched_overview(scene, [size[0] - covered, size[1]], exaggeration);
+        let camera = Camera { size, ..overview::stretched(&free, exaggeration) };
+        // The middle of the free part is left of the picture's.
+        let pixels = f64::from(covered) / 2.0;
+        let distance = (camera.target - camera.eye).length();
+        let by = camera.axes()[0] * (pixels / camera.pixels_per_radian() * distance);
+        Camera { eye: camera.eye + by, target: camera.target + by, ..camera }
     }
 
     /// Turns until north is up, around the middle of the picture.
     fn north_up(&mut self) {
-        let middle = DVec2::from(self.camera().size.map(|s| f64::from(s) / 2.0));
-        let pivot = self.pivot(middle);
+        let pivot = self.pivot(self.middle());
         self.controls.glide_north(pivot);
     }
 
-    /// Flies to where the whole scene is seen.
+    /// Flies to where all is seen that is shown.
     fn frame_scene(&mut self) {
-        let camera = self.camera();
-        let whole =
-            overview::stretched_overview(&self.terrain.shown_scene(), camera.size, self.look.exaggeration);
-        self.controls.glide_to(overview::stretched(&whole, self.look.exaggeration));
+        self.controls.glide_to(self.whole(&self.terrain.shown_scene()));
     }
 
     fn ask_screenshot(&mut self) {
@@ -545,15 +608,19 @@ impl Viewer {
         self.asks.push(Ask::Screenshot(path));
     }
 
+    /// The ground in the middle of the picture stays there, and as far away.
     fn set_exaggeration(&mut self, exaggeration: f64) {
         let by = exaggeration / self.look.exaggeration;
+        let ground = self.pivot(self.middle()).z;
         self.look.exaggeration = exaggeration;
         self.terrain.set_exaggeration(exaggeration);
-        self.controls.stretch(by);
-        for p in [&mut self.home.eye, &mut self.home.target] {
-            p.z *= by;
-        }
+        self.controls.lift(ground * (by - 1.0));
         self.frozen = None;
+    }
+
+    /// The middle of the picture, in pixels.
+    fn middle(&self) -> DVec2 {
+        DVec2::from(self.camera().size.map(|s| f64::from(s) / 2.0))
     }
 }
 

@@ -21,15 +21,18 @@ pub(super) struct History {
 }
 
 impl History {
-    pub(super) fn note(&mut self, seconds: f64, frame: &FrameView) {
+    /// `seconds`: since the frame before, if that asked for this one.
+    pub(super) fn note(&mut self, seconds: Option<f64>, frame: &FrameView) {
         let bytes = frame.stats.traffic.bytes;
-        #[allow(clippy::cast_possible_truncation, reason = "for a plot")]
-        let values = [seconds * 1e3, frame.error_pixels, bytes.saturating_sub(self.bytes) as f64 / 1e3]
-            .map(|v| v as f32);
+        let kilobytes = bytes.saturating_sub(self.bytes) as f64 / 1e3;
         self.bytes = bytes;
-        for (list, value) in
-            [&mut self.milliseconds, &mut self.errors, &mut self.kilobytes].into_iter().zip(values)
-        {
+        for (list, value) in [
+            (&mut self.milliseconds, seconds.map(|seconds| seconds * 1e3)),
+            (&mut self.errors, Some(frame.error_pixels)),
+            (&mut self.kilobytes, Some(kilobytes)),
+        ] {
+            #[allow(clippy::cast_possible_truncation, reason = "for a plot")]
+            let Some(value) = value.map(|value| value as f32) else { continue };
             list.push_back(value);
             if list.len() > HISTORY {
                 list.pop_front();
@@ -37,10 +40,17 @@ impl History {
         }
     }
 
-    /// Frames a second, over the last half second or so.
-    fn rate(&self) -> f32 {
-        let last: Vec<f32> = self.milliseconds.iter().rev().take(30).copied().collect();
-        1e3 * last.len() as f32 / last.iter().sum::<f32>().max(1e-3)
+    /// Frames a second, over the last ones of half a second together, or the last one.
+    fn rate(&self) -> Option<f32> {
+        let (mut count, mut sum) = (0.0, 0.0);
+        for milliseconds in self.milliseconds.iter().rev() {
+            count += 1.0;
+            sum += milliseconds;
+            if sum >= 500.0 {
+                break;
+            }
+        }
+        (sum > 0.0).then(|| 1e3 * count / sum)
     }
 }
 
@@ -284,7 +294,11 @@ fn figures(viewer: &Viewer, ui: &mut Ui) {
             ui.with_layout(egui::Layout::right_to_left(egui::Align::Center), |ui| ui.monospace(value));
         });
     };
-    row("frames a second", format!("{:.0}", viewer.history.rate()));
+    let rate = viewer.history.rate();
+    row(
+        "frames a second",
+        rate.map_or("-".to_owned(), |rate| format!("{rate:.*}", usize::from(rate < 10.0))),
+    );
     row("largest error", format!("{:.2} px", frame.error_pixels));
     row("triangles", grouped(viewer.drawn.triangles));
     row("diamonds drawn", grouped(frame.items.len() as u64));
@@ -396,7 +410,7 @@ fn progress(viewer: &Viewer, ui: &mut Ui) {
     let frame = &viewer.frame;
     let rect = ui.max_rect();
     let painter = ui.painter();
-    let mut text = viewer.message.clone();
+    let mut text = viewer.message.as_ref().map(|message| message.text.clone());
     if !frame.complete {
         let goal = frame.error_pixels_goal.max(viewer.terrain.tolerance_pixels());
         // By the order of size of what is still wrong.

@@ -24,10 +24,14 @@ impl Hand {
 
     /// Over a scene with so many layers.
     fn of(layers: usize, camera: Option<Camera>) -> Self {
+        Self::with(layers, Look::default(), camera)
+    }
+
+    fn with(layers: usize, look: Look, camera: Option<Camera>) -> Self {
         let served = Served::start(layers, Faults::default());
         let terrain =
             Terrain::open(&served.url, Options { fetch: fetch::Options::default(), ..Options::default() });
-        let viewer = Viewer::new(terrain.unwrap(), &served.url, Look::default(), SIZE, camera);
+        let viewer = Viewer::new(terrain.unwrap(), &served.url, look, SIZE, camera);
         let mut hand = Self { viewer, context: egui::Context::default(), seconds: 0.0, served };
         hand.settle();
         hand
@@ -39,7 +43,11 @@ impl Hand {
     }
 
     fn frame_with(&mut self, modifiers: Modifiers, events: &[Event]) {
-        self.seconds += 1.0 / 60.0;
+        self.frame_after(1.0 / 60.0, modifiers, events);
+    }
+
+    fn frame_after(&mut self, seconds: f64, modifiers: Modifiers, events: &[Event]) {
+        self.seconds += seconds;
         let size = SIZE.map(|s| s as f32);
         let input = RawInput {
             screen_rect: Some(Rect::from_min_size(Pos2::ZERO, vec2(size[0], size[1]))),
@@ -256,10 +264,12 @@ fn an_address_opens_the_same_view_again() {
     let (url, view) = address.split_once('#').unwrap();
     assert_eq!(url, hand.viewer.url);
     let camera = camera_at(view, SIZE).unwrap();
-    let mut again = Hand::new(Some(camera));
-    again.viewer.set_exaggeration(2.5);
+    let again = Hand::with(1, *hand.viewer.look(), Some(camera));
     let [a, b] = [&hand, &again].map(Hand::camera);
     assert!((a.eye - b.eye).length() < 0.1, "{} {}", a.eye, b.eye);
+    let [ahead, also] = [a, b].map(|camera| (camera.target - camera.eye).normalize());
+    assert!((ahead - also).length() < 1e-4, "{ahead} {also}");
+    assert_eq!(address, again.viewer.address());
     for wrong in ["", "1,2,3", "1,2,3,4,x", "1,2,nan,0,0", "1,2,3,0,95", "1,2,3,4,5,x", "1,2,3,4,5,6,7"] {
         assert!(camera_at(wrong, SIZE).is_none(), "{wrong}");
     }
@@ -409,19 +419,137 @@ fn the_true_view_is_plain_and_can_be_left_again() {
     hand.viewer.set_exaggeration(3.0);
     hand.viewer.terrain.set_morph_seconds(0.3);
     let (before, eye) = (*hand.viewer.look(), hand.camera().eye);
+    let ground = hand.viewer.pivot(hand.viewer.middle());
     assert!(!hand.viewer.is_true());
     hand.viewer.set_true(true);
     let look = *hand.viewer.look();
     assert!(hand.viewer.is_true() && look.exaggeration == 1.0 && look.haze == 0.0, "{look:?}");
     assert!(!look.water.reflecting && look.background != crate::render::Background::Sky, "{look:?}");
     assert_eq!(hand.viewer.terrain.morph_seconds(), 0.0);
-    assert!((hand.camera().eye.z * 3.0 - eye.z).abs() < 1e-6, "the view stays");
+    let here = ground.with_z(ground.z / 3.0);
+    assert!(((hand.camera().eye - here) - (eye - ground)).length() < 1e-6, "the view stays");
     hand.settle();
     hand.viewer.look.colours = crate::render::Colours::Slope;
     hand.viewer.set_true(false);
     let expected = Look { colours: crate::render::Colours::Slope, ..before };
     assert_eq!((*hand.viewer.look(), hand.viewer.terrain.morph_seconds()), (expected, 0.3));
-    assert!((hand.camera().eye - eye).length() < 1e-6);
+    assert!((hand.camera().eye - eye).length() < 0.01 * (eye - ground).length());
+}
+
+#[test]
+fn what_is_in_the_middle_stays_there_while_heights_grow() {
+    let mut hand = Hand::new(Some(looking_down()));
+    let before = hand.camera();
+    let ground = hand.viewer.pivot(hand.viewer.middle());
+    hand.viewer.set_exaggeration(4.0);
+    let after = hand.camera();
+    let drawn = ground.with_z(4.0 * ground.z);
+    assert!(((after.eye - drawn) - (before.eye - ground)).length() < 1e-6, "{} {}", before.eye, after.eye);
+    hand.settle();
+    let found = hand.viewer.pivot(hand.viewer.middle());
+    assert!((found - drawn).length() < 0.05 * (after.eye - drawn).length(), "{found} {drawn}");
+}
+
+#[test]
+fn the_whole_scene_lies_beside_the_panel() {
+    let mut hand = Hand::new(None);
+    let covered = hand.viewer.covered;
+    assert!(covered > 200 && covered < 400, "{covered}");
+    let camera = hand.camera();
+    let scene = hand.viewer.terrain.shown_scene();
+    let [low, high] = overview::extent(&scene);
+    for i in 0..4 {
+        let corner = DVec3::new(
+            if i & 1 == 0 { low.x } else { high.x },
+            if i & 2 == 0 { low.y } else { high.y },
+            low.z,
+        );
+        let [at, _] = boxes::seen(&camera, [corner; 2]).unwrap();
+        assert!(at.x > 0.0 && at.x < f64::from(SIZE[0] - covered), "{at}");
+    }
+    // Without it, in the middle.
+    hand.key(Key::Tab, true);
+    hand.key(Key::Tab, false);
+    hand.frame(&[]);
+    hand.key(Key::H, true);
+    hand.settle();
+    assert_eq!(hand.viewer.covered, 0);
+    assert!((hand.camera().target.x - f64::midpoint(low.x, high.x)).abs() < 1e-6 * (high.x - low.x));
+}
+
+#[test]
+fn slow_frames_are_told_and_messages_go() {
+    let mut hand = Hand::new(Some(looking_down()));
+    hand.viewer.tell("saved");
+    // It moves as long as the key is held, so each frame asks for the next.
+    hand.key(Key::W, true);
+    (0..4).for_each(|_| hand.frame_after(0.5, Modifiers::NONE, &[]));
+    let rate = hand.viewer.history.rate().unwrap();
+    assert!((rate - 2.0).abs() < 0.01, "{rate} frames a second");
+    assert!(hand.viewer.message.is_some());
+    hand.key(Key::W, false);
+    hand.settle();
+    // After a rest the time since the last frame is not what a frame takes, nor does anything jump.
+    let before = hand.camera();
+    hand.frame_after(MESSAGE_SECONDS, Modifiers::NONE, &[]);
+    hand.frame(&[]);
+    assert!(hand.viewer.history.rate().unwrap() < 100.0);
+    assert_eq!(hand.camera(), before);
+}
+
+#[test]
+fn what_was_clicked_is_marked_in_the_picture() {
+    let mut hand = Hand::new(Some(looking_down()));
+    let [a, b] = hand.solid();
+    let shapes = |hand: &mut Hand| {
+        let input = RawInput {
+            screen_rect: Some(Rect::from_min_size(Pos2::ZERO, vec2(SIZE[0] as f32, SIZE[1] as f32))),
+            time: Some(hand.seconds + 1.0),
+            ..RawInput::default()
+        };
+        let viewer = &mut hand.viewer;
+        let output = hand.context.run_ui(input, |ui| viewer.update(ui));
+        let shapes: Vec<egui::Shape> = output.shapes.iter().map(|shape| shape.shape.clone()).collect();
+        output.drop_without_applying_deltas();
+        shapes
+    };
+    let near = |shapes: &[egui::Shape], at: Pos2| {
+        shapes.iter().any(|s| matches!(s, egui::Shape::Circle(c) if c.center.distance(at) < 1.5))
+    };
+    let lines = |shapes: &[egui::Shape]| {
+        shapes.iter().filter(|shape| matches!(shape, egui::Shape::LineSegment { .. })).count()
+    };
+    let before = shapes(&mut hand);
+    assert!(!near(&before, a));
+    hand.click(a);
+    hand.seconds += 1.0;
+    hand.click(b);
+    let after = shapes(&mut hand);
+    assert!(near(&after, a) && near(&after, b), "{:?} at {a} and {b}", hand.viewer.marks());
+    assert!(lines(&after) > lines(&before) + 100, "the profile between them");
+}
+
+/// Whoever has all of a version asks for nothing, and yet learns of the next one.
+#[test]
+fn a_new_version_is_noticed_while_nothing_is_missing() {
+    let served = Served::start(1, Faults::default());
+    let fetch = fetch::Options { follow: Some(Duration::from_millis(20)), ..fetch::Options::default() };
+    let terrain = Terrain::open(&served.url, Options { fetch, ..Options::default() }).unwrap();
+    let viewer = Viewer::new(terrain, &served.url, Look::default(), SIZE, Some(looking_down()));
+    let mut hand = Hand { viewer, context: egui::Context::default(), seconds: 0.0, served };
+    hand.settle();
+    for _ in 0..50 {
+        hand.frame(&[]);
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    assert!(!hand.viewer.terrain.scene_changed(), "the same version is none");
+    hand.served.misbehave(Faults { gone: true, ..Faults::default() });
+    let until = Instant::now() + Duration::from_secs(60);
+    while !hand.viewer.terrain.scene_changed() {
+        hand.frame(&[]);
+        assert!(Instant::now() < until);
+        std::thread::sleep(Duration::from_millis(2));
+    }
 }
 
 /// What is written in a frame, and where.
