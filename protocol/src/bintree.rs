@@ -163,12 +163,6 @@ impl Forest {
         Self::new(root_log2, patch_log2, [w.div_ceil(1 << log2), h.div_ceil(1 << log2)])
     }
 
-    /// One root square of 2^`root_log2` cells, for its addresses alone: not for streaming, since it may be
-    /// smaller than any patch. `root_log2` at most [`ROOT_LOG2_MAX`].
-    pub(crate) fn single(root_log2: u8) -> Self {
-        Self { root_log2: root_log2.min(ROOT_LOG2_MAX), patch_log2: 0, roots: [1, 1], precision: 0 }
-    }
-
     /// Base-2 logarithm of the cells along a root square's side.
     #[must_use]
     pub fn root_log2(&self) -> u32 {
@@ -277,11 +271,6 @@ impl Triangle {
     #[must_use]
     pub fn level(self) -> u32 {
         62 - self.path.leading_zeros()
-    }
-
-    /// The path: from 2, one bit longer at each level; unique in its root square.
-    pub(crate) fn path(self) -> u64 {
-        self.path
     }
 
     /// The triangle that splits into this one; `None` for the half of a root square.

@@ -26,7 +26,7 @@ mod mesh;
 
 pub use mesh::Corner;
 
-use crate::bintree::{Forest, Point};
+use crate::bintree::Point;
 use std::ops::ControlFlow;
 
 /// The largest grid: 2^12 + 1 points a side; 134 MB of counts and as much of heights.
@@ -64,6 +64,28 @@ pub struct Facet {
 }
 
 impl Facet {
+    /// The triangle with these corners, turning left, apex in the middle, of a grid of 2^`log2` cells a side, if its corners
+    /// are so high; `None` if it is none of that grid's. Costs one step a level.
+    #[must_use]
+    pub fn new(log2: u8, corners: [Point; 3], heights: [f64; 3]) -> Option<Self> {
+        if log2 > LOG2_MAX || corners.iter().flatten().any(|w| *w > 1 << log2) {
+            return None;
+        }
+        let [a, c, b] = corners;
+        // Halfway between the apex and the middle: four times as far along both axes.
+        let inside = [0, 1].map(|i| (a[i] + 2 * c[i] + b[i]).cast_signed());
+        let [lower, upper] = root_corners(log2);
+        let (mut path, mut at) = if inside[0] > inside[1] { lower } else { upper };
+        for _ in 0..2 * log2 {
+            if at == corners {
+                break;
+            }
+            let m = middle(at);
+            (path, at) = split(path, at, m)[usize::from(!is_left(at, m, inside))];
+        }
+        (at == corners).then_some(Self { path, corners, heights })
+    }
+
     /// Its corners, turning left, apex in the middle.
     #[must_use]
     pub fn corners(&self) -> [Point; 3] {
@@ -141,20 +163,22 @@ impl Bitree {
             return None;
         }
         for root in bitree.roots() {
-            bitree.recount(root.path, root.corners);
+            let [a, c, _] = root.corners.map(|corner| bitree.slot(corner).cast_signed());
+            let middle = bitree.slot(root.middle());
+            bitree.recount(root.path, middle, c - middle.cast_signed(), a - middle.cast_signed());
         }
         Some(bitree)
     }
 
-    /// Counts the real middles at and below a triangle.
-    fn recount(&mut self, path: u32, corners: [Point; 3]) -> u32 {
-        if path as usize >= self.below.len() {
-            return 0;
-        }
-        let m = middle(corners);
-        let mut count = u32::from(!self.real[self.slot(m)].is_nan());
-        for (child, corners) in split(path, corners, m) {
-            count += self.recount(child, corners);
+    /// Counts the real middles at and below a triangle: by the slot of its middle and the steps in slots from there to its
+    /// apex c and to the end a of its hypotenuse.
+    fn recount(&mut self, path: u32, middle: usize, to_apex: isize, to_end: isize) -> u32 {
+        let mut count = u32::from(!self.real[middle].is_nan());
+        if (2 * path as usize) < self.below.len() {
+            let [to_left, to_right] = [(to_apex + to_end) / 2, (to_apex - to_end) / 2];
+            let [left, right] = [to_left, to_right].map(|step| middle.wrapping_add_signed(step));
+            count += self.recount(path << 1, left, -to_left, to_right);
+            count += self.recount(path << 1 | 1, right, -to_right, -to_left);
         }
         self.below[path as usize] = count;
         count
@@ -174,8 +198,7 @@ impl Bitree {
 
     /// South-west, south-east, north-east, north-west.
     fn outermost(&self) -> [Point; 4] {
-        let side = self.side();
-        [[0, 0], [side, 0], [side, side], [0, side]]
+        outermost(self.log2)
     }
 
     fn slot(&self, [x, y]: Point) -> usize {
@@ -255,10 +278,7 @@ impl Bitree {
         let mut at = if place[0] > place[1] { lower } else { upper };
         for _ in 0..level {
             let (m, height) = self.middle(&at);
-            // Four times the grid's side at most, so products stay below 2^30.
-            let [[mx, my], [cx, cy]] = [m, at.corners[1]].map(|p| p.map(u32::cast_signed));
-            let is_left = (mx - cx) * (place[1] - 4 * cy) > (my - cy) * (place[0] - 4 * cx);
-            at = at.half(!is_left, m, height);
+            at = at.half(!is_left(at.corners, m, place), m, height);
         }
         Some(at)
     }
@@ -266,15 +286,10 @@ impl Bitree {
     /// The two halves of the grid.
     #[must_use]
     pub fn roots(&self) -> [Facet; 2] {
-        let forest = Forest::single(self.log2);
-        let mut roots = forest.root_triangles().map(|t| {
-            let corners = forest.corners(t).unwrap_or_default();
+        root_corners(self.log2).map(|(path, corners)| {
             let heights = corners.map(|p| self.real[self.slot(p)]);
-            Facet { path: u32::try_from(t.path()).unwrap_or(u32::MAX), corners, heights }
-        });
-        // A single square has exactly two.
-        let nothing = Facet { path: 2, corners: [[0; 2]; 3], heights: [0.0; 3] };
-        [roots.next().unwrap_or(nothing), roots.next().unwrap_or(nothing)]
+            Facet { path, corners, heights }
+        })
     }
 
     /// The triangle of a path, see [`Facet::path`]; `None` out of its range. Costs one step a level.
@@ -366,30 +381,11 @@ impl Bitree {
         ControlFlow::Continue(())
     }
 
-    /// The ends of the hypotenuse in whose middle a point stands; `None` for the corners and outside of the grid.
-    #[must_use]
-    pub fn hypotenuse(&self, point: Point) -> Option<[Point; 2]> {
-        self.level(point).filter(|level| *level > 0)?;
-        let [x, y] = point;
-        let zeros = (x | y).trailing_zeros();
-        let step = 1u32 << zeros;
-        let is_odd = |w: u32| w >> zeros & 1 == 1;
-        Some(match (is_odd(x), is_odd(y)) {
-            (true, false) => [[x - step, y], [x + step, y]],
-            (false, _) => [[x, y - step], [x, y + step]],
-            // Diagonals of neighbouring squares meet in the centres of those twice as large.
-            (true, true) if (x >> (zeros + 1) ^ y >> (zeros + 1)) & 1 == 0 => {
-                [[x - step, y - step], [x + step, y + step]]
-            }
-            (true, true) => [[x - step, y + step], [x + step, y - step]],
-        })
-    }
-
     /// How high the surface is at a point where nothing is real but what is above it: the mean of the ends of its
-    /// hypotenuse. `None` as of [`Self::hypotenuse`].
+    /// hypotenuse. `None` as of [`hypotenuse`].
     #[must_use]
     pub fn height_without(&self, point: Point) -> Option<f64> {
-        let [a, b] = self.hypotenuse(point)?.map(|end| self.real[self.slot(end)]);
+        let [a, b] = hypotenuse(self.log2, point)?.map(|end| self.real[self.slot(end)]);
         let mean = (a + b) / 2.0;
         if !mean.is_nan() {
             return Some(mean);
@@ -428,49 +424,6 @@ impl Bitree {
     }
 }
 
-/// A bitree to which many points are added before it is asked what it draws: triangles are counted once, at the end.
-#[derive(Debug)]
-pub struct Draft(Bitree);
-
-impl Draft {
-    /// From a selection so far.
-    #[must_use]
-    pub fn of(tree: Bitree) -> Self {
-        Self(tree)
-    }
-
-    /// See [`Bitree::add`].
-    pub fn add(&mut self, point: Point, height: f64) -> Option<f64> {
-        if !self.0.inside(point) || height.is_nan() {
-            return None;
-        }
-        let slot = self.0.slot(point);
-        let before = std::mem::replace(&mut self.0.real[slot], height);
-        (!before.is_nan()).then_some(before)
-    }
-
-    /// See [`Bitree::around`].
-    #[must_use]
-    pub fn around(&self, point: Point) -> [Option<Facet>; 2] {
-        self.0.around(point)
-    }
-
-    /// See [`Bitree::halves`].
-    #[must_use]
-    pub fn halves(&self, facet: &Facet) -> [Facet; 2] {
-        self.0.halves(facet)
-    }
-
-    /// The selection. Costs one step a triangle of the grid.
-    #[must_use]
-    pub fn finish(mut self) -> Bitree {
-        for root in self.0.roots() {
-            self.0.recount(root.path, root.corners);
-        }
-        self.0
-    }
-}
-
 /// What was selected is the same; counts follow from it.
 impl PartialEq for Bitree {
     fn eq(&self, other: &Self) -> bool {
@@ -487,6 +440,46 @@ pub fn level(log2: u8, [x, y]: Point) -> u32 {
     // On the lattice of squares of 2^zeros cells: centres of larger squares, or middles of their sides.
     let both_odd = (x >> zeros) & (y >> zeros) & 1 == 1;
     if up == 0 { 0 } else { 2 * up - u32::from(both_odd) }
+}
+
+/// The ends of the hypotenuse in whose middle a point of a grid of 2^`log2` cells a side stands; `None` for the grid's
+/// corners and outside of it.
+#[must_use]
+pub fn hypotenuse(log2: u8, [x, y]: Point) -> Option<[Point; 2]> {
+    if x.max(y) > 1 << log2 || level(log2, [x, y]) == 0 {
+        return None;
+    }
+    let zeros = (x | y).trailing_zeros();
+    let step = 1u32 << zeros;
+    let is_odd = |w: u32| w >> zeros & 1 == 1;
+    Some(match (is_odd(x), is_odd(y)) {
+        (true, false) => [[x - step, y], [x + step, y]],
+        (false, _) => [[x, y - step], [x, y + step]],
+        // Diagonals of neighbouring squares meet in the centres of those twice as large.
+        (true, true) if (x >> (zeros + 1) ^ y >> (zeros + 1)) & 1 == 0 => {
+            [[x - step, y - step], [x + step, y + step]]
+        }
+        (true, true) => [[x - step, y + step], [x + step, y - step]],
+    })
+}
+
+/// South-west, south-east, north-east, north-west of a grid of 2^`log2` cells a side.
+fn outermost(log2: u8) -> [Point; 4] {
+    let side = 1 << log2;
+    [[0, 0], [side, 0], [side, side], [0, side]]
+}
+
+/// Path and corners of both halves of a grid of 2^`log2` cells a side.
+fn root_corners(log2: u8) -> [(u32, [Point; 3]); 2] {
+    let [sw, se, ne, nw] = outermost(log2);
+    [(2, [sw, se, ne]), (3, [ne, nw, sw])]
+}
+
+/// Whether a place, in quarters of cells, is on the left half's side of the line from a triangle's apex to its middle.
+fn is_left([_, c, _]: [Point; 3], m: Point, place: [i32; 2]) -> bool {
+    // Four times the grid's side at most, so products stay below 2^30.
+    let [[mx, my], [cx, cy]] = [m, c].map(|p| p.map(u32::cast_signed));
+    (mx - cx) * (place[1] - 4 * cy) > (my - cy) * (place[0] - 4 * cx)
 }
 
 /// Path and corners of both halves, left then right.
@@ -542,15 +535,30 @@ mod tests {
         }
         for point in (0..=16).flat_map(|y| (0..=16).map(move |x| [x, y])) {
             let facets: Vec<Facet> = bitree.around(point).into_iter().flatten().collect();
-            assert_eq!(bitree.hypotenuse(point).is_some(), !facets.is_empty(), "{point:?}");
+            assert_eq!(hypotenuse(4, point).is_some(), !facets.is_empty(), "{point:?}");
             for facet in facets {
                 let ([a, _, b], [ha, _, hb]) = (facet.corners(), facet.heights());
-                let ends = bitree.hypotenuse(point).unwrap();
+                let ends = hypotenuse(4, point).unwrap();
                 assert!(ends == [a, b] || ends == [b, a], "{point:?}: {ends:?}");
                 assert_eq!(bitree.height_without(point), Some((ha + hb) / 2.0), "{point:?}");
             }
         }
-        assert_eq!(bitree.hypotenuse([17, 3]), None);
+        assert_eq!(hypotenuse(4, [17, 3]), None);
+    }
+
+    #[test]
+    fn triangles_are_found_by_their_corners_and_others_are_not() {
+        let mut open = flat(3).roots().to_vec();
+        while let Some(facet) = open.pop() {
+            let [a, c, b] = facet.corners();
+            assert_eq!(Facet::new(3, [a, c, b], facet.heights()), Some(facet));
+            assert_eq!(Facet::new(3, [b, c, a], facet.heights()), None, "turns right");
+            if facet.level() < 6 {
+                open.extend(flat(3).halves(&facet));
+            }
+        }
+        assert_eq!(Facet::new(3, [[0, 1], [1, 1], [1, 2]], [0.0; 3]), None, "the other diagonal");
+        assert_eq!(Facet::new(3, [[u32::MAX; 2]; 3], [0.0; 3]), None, "outside");
     }
 
     #[test]
@@ -576,18 +584,6 @@ mod tests {
                 assert_eq!(told, is, "{point:?}");
             }
         }
-    }
-
-    #[test]
-    fn a_draft_becomes_what_single_points_make() {
-        let mut bitree = flat(3);
-        bitree.add([4, 4], 1.0);
-        let mut draft = Draft::of(bitree.clone());
-        for (point, height) in [([1, 2], 7.0), ([6, 6], 3.0), ([4, 4], 2.0), ([0, 0], 5.0), ([9, 0], 1.0)] {
-            assert_eq!(draft.add(point, height), bitree.add(point, height), "{point:?}");
-            assert_eq!(draft.around([2, 2]), bitree.around([2, 2]));
-        }
-        assert_eq!(draft.finish(), bitree);
     }
 
     #[test]
@@ -685,6 +681,7 @@ mod tests {
                     needed.insert(*p);
                     // Its apex is the middle of the triangle that it came from, and so on up.
                     prop_assert_eq!(bitree.facet(facet.path), Some(facet));
+                    prop_assert_eq!(Facet::new(4, facet.corners, facet.heights), Some(facet));
                     let mut at = bitree.roots().into_iter().find(|r| r.path == facet.path >> facet.level()).unwrap();
                     for step in (0..facet.level()).rev() {
                         needed.insert(at.middle());

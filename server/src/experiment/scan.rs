@@ -48,24 +48,28 @@ impl Plane {
 /// The runs of samples of a triangle, border included: calls `visit` with y and the first and last x of
 /// each row, from the south, until it answers false.
 pub fn rows(corners: [Point; 3], mut visit: impl FnMut(u32, u32, u32) -> bool) {
-    let [a, c, b] = corners;
-    let sides = [[a, c], [c, b], [b, a]].map(|[p, q]| if p[1] <= q[1] { [p, q] } else { [q, p] });
-    let (south, north) = (a[1].min(c[1]).min(b[1]), a[1].max(c[1]).max(b[1]));
-    for y in south..=north {
-        let (mut first, mut last) = (u32::MAX, 0);
-        // Level sides end where the others do.
-        for [p, q] in sides.into_iter().filter(|[p, q]| p[1] < q[1] && (p[1]..=q[1]).contains(&y)) {
-            // Other sides are upright or diagonal: as far along x as along y, or not at all.
-            let x = match p[0].cmp(&q[0]) {
-                std::cmp::Ordering::Less => p[0] + (y - p[1]),
-                std::cmp::Ordering::Equal => p[0],
-                std::cmp::Ordering::Greater => p[0] - (y - p[1]),
-            };
-            (first, last) = (first.min(x), last.max(x));
+    let [mut south, mut bend, mut north] = corners;
+    for _ in 0..2 {
+        if bend[1] < south[1] {
+            (south, bend) = (bend, south);
         }
-        if !visit(y, first, last) {
+        if north[1] < bend[1] {
+            (bend, north) = (north, bend);
+        }
+    }
+    // Sides that are not level are upright or diagonal: as far along x as along y, or not at all.
+    let step = |from: Point, to: Point| (to[0].cast_signed() - from[0].cast_signed()).signum();
+    // From south to north lead one side, and the two others.
+    let (mut one, mut other) = (south[0], south[0]);
+    let (along_one, mut along_other) = (step(south, north), step(south, bend));
+    for y in south[1]..=north[1] {
+        if y == bend[1] {
+            (other, along_other) = (bend[0], step(bend, north));
+        }
+        if !visit(y, one.min(other), one.max(other)) {
             return;
         }
+        (one, other) = (one.wrapping_add_signed(along_one), other.wrapping_add_signed(along_other));
     }
 }
 

@@ -69,12 +69,7 @@ impl Criterion {
         let field = ground.field;
         match self {
             Self::Vertical => vertical_error(field, ground.weights, facet.corners(), facet.heights(), enough),
-            Self::Euclidean => {
-                let upright = upright(field, facet);
-                // A little more, lest a search end at what rounds down to enough.
-                let enough = enough / upright * (1.0 + 1e-12);
-                upright * vertical_error(field, ground.weights, facet.corners(), facet.heights(), enough)
-            }
+            Self::Euclidean => euclidean_error(ground, facet.corners(), facet.heights(), enough),
             Self::Curvature => curvature_sum(ground, facet, enough),
             Self::Normal => normal_error(ground, facet, enough),
             Self::Coefficient => {
@@ -122,6 +117,24 @@ impl Criterion {
         self == Self::Vertical && ground.weight(slot) * off.abs() > tolerance
     }
 
+    /// Whether the error of a triangle with these corners, apex in the middle, is more than the tolerance.
+    pub(super) fn exceeds(
+        self,
+        ground: &Ground<'_>,
+        corners: [Point; 3],
+        heights: [f64; 3],
+        tolerance: f64,
+    ) -> bool {
+        let field = ground.field;
+        let error = match self {
+            Self::Vertical => vertical_error(field, ground.weights, corners, heights, tolerance),
+            Self::Euclidean => euclidean_error(ground, corners, heights, tolerance),
+            Self::Curvature | Self::Normal | Self::Coefficient => Facet::new(field.log2(), corners, heights)
+                .map_or(0.0, |facet| self.error(ground, &facet, tolerance)),
+        };
+        error > tolerance
+    }
+
     /// The points whose coefficients are more than the tolerance; by another criterion, the corners alone.
     pub(super) fn direct(self, ground: &Ground<'_>, tolerance: f64) -> Bitree {
         let mut tree = ground.field.tree();
@@ -157,15 +170,18 @@ fn coefficients(ground: &Ground<'_>) -> Vec<(f64, Point)> {
     (0..field.heights().len()).filter_map(of).collect()
 }
 
-/// The vertical part of the unit normal of a triangle.
-fn upright(field: &Field, facet: &Facet) -> f64 {
-    let [sx, sy] = slopes(field, facet);
-    1.0 / (1.0 + sx * sx + sy * sy).sqrt()
+fn euclidean_error(ground: &Ground<'_>, corners: [Point; 3], heights: [f64; 3], enough: f64) -> f64 {
+    let [sx, sy] = slopes(ground.field, corners, heights);
+    // The vertical part of the triangle's unit normal.
+    let upright = 1.0 / (1.0 + sx * sx + sy * sy).sqrt();
+    // A little more, lest a search end at what rounds down to enough.
+    let enough = enough / upright * (1.0 + 1e-12);
+    upright * vertical_error(ground.field, ground.weights, corners, heights, enough)
 }
 
 /// Metres of height a metre along x and y.
-fn slopes(field: &Field, facet: &Facet) -> [f64; 2] {
-    let [sx, sy] = Plane::new(facet.corners(), facet.heights()).slope();
+fn slopes(field: &Field, corners: [Point; 3], heights: [f64; 3]) -> [f64; 2] {
+    let [sx, sy] = Plane::new(corners, heights).slope();
     [sx / field.cell()[0], sy / field.cell()[1]]
 }
 
@@ -192,13 +208,13 @@ fn curvature_sum(ground: &Ground<'_>, facet: &Facet, enough: f64) -> f64 {
 fn normal_error(ground: &Ground<'_>, facet: &Facet, enough: f64) -> f64 {
     let field = ground.field;
     let full = ground.full.get_or_init(|| field.full_tree());
-    let own = unit_normal(slopes(field, facet));
+    let own = unit_normal(slopes(field, facet.corners(), facet.heights()));
     let mut worst = 0.0f64;
     if let Some(all) = full.facet(facet.path()) {
         let _ = full.leaves(&all, &mut |finest| {
             let corners = finest.corners();
             if corners.iter().all(|p| !field.at(*p).is_nan()) {
-                let other = unit_normal(slopes(field, finest));
+                let other = unit_normal(slopes(field, corners, finest.heights()));
                 let weight = corners.iter().map(|p| ground.weight(field.slot(*p))).fold(0.0, f64::max);
                 worst = worst.max(weight * angle(own, other).to_degrees());
             }

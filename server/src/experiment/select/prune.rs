@@ -5,6 +5,7 @@
 //! drawn triangles below those two stay within the tolerance. The finest go first: there are most of them, and each
 //! that goes may let its triangle vanish.
 
+use super::top_down::diamonds;
 use super::{Criterion, Ground};
 use diamantina_protocol::bintree::Point;
 use diamantina_protocol::bitree::Bitree;
@@ -67,22 +68,13 @@ fn has_to_stay(
 
 /// The real points, the finest first, and row by row; without the corners, which always stay.
 fn real_points(tree: &Bitree) -> Vec<Point> {
-    let side = tree.side();
     let mut points = Vec::new();
-    for step in (0..tree.log2()).map(|z| 1u32 << z) {
-        // Middles of the sides of squares, then their centres.
-        for is_centre in [false, true] {
-            for y in (0..=side).step_by(step as usize) {
-                let is_odd = y & step > 0;
-                let first = match (is_centre, is_odd) {
-                    (true, false) => continue,
-                    (false, true) => 0,
-                    (true, true) | (false, false) => step,
-                };
-                let row = (first..=side).step_by(2 * step as usize).map(|x| [x, y]);
-                points.extend(row.filter(|p| tree.real(*p).is_some()));
+    for level in (0..2 * tree.log2()).rev() {
+        diamonds(tree.log2(), level, |middle, _| {
+            if tree.real(middle).is_some() {
+                points.push(middle);
             }
-        }
+        });
     }
     points
 }

@@ -64,6 +64,38 @@ fn plainly(field: &Field, weights: Option<&[f32]>, tree: &Bitree) -> f64 {
     worst
 }
 
+/// Level by level over a list of triangles, each point added by itself and each error measured in full.
+fn descend_plainly(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, share: f64) -> Bitree {
+    let field = ground.field();
+    let mut tree = field.tree();
+    let mut now = tree.roots().to_vec();
+    for _ in 0..2 * field.log2() {
+        now.retain(|facet| criterion.error(ground, facet, f64::INFINITY) > tolerance);
+        let mut halved = now.clone();
+        for facet in &now {
+            let m = facet.middle();
+            let [ha, _, hb] = facet.heights();
+            let off = field.at(m) - (ha + hb) / 2.0;
+            let is_off = match criterion {
+                Criterion::Vertical | Criterion::Euclidean => off.abs() > share * tolerance,
+                Criterion::Curvature => true,
+                Criterion::Normal | Criterion::Coefficient => off != 0.0,
+            };
+            if off.is_nan() && criterion == Criterion::Curvature {
+                if let Some(below) = field.known_below(facet.corners()) {
+                    tree.add(below, field.at(below));
+                }
+            } else if is_off && !off.is_nan() && tree.add(m, field.at(m)).is_none() {
+                halved.extend(tree.around(m).into_iter().flatten());
+            }
+        }
+        halved.sort_by_key(|facet| facet.path());
+        halved.dedup_by_key(|facet| facet.path());
+        now = halved.iter().flat_map(|facet| tree.halves(facet)).collect();
+    }
+    tree
+}
+
 /// Takes out each point and puts it back where the selection is not good then, three times over all of them.
 fn prune_plainly(field: &Field, tree: &mut Bitree, is_good: impl Fn(&Bitree, [u32; 2]) -> bool) {
     let mut all: Vec<_> = (0..field.heights().len()).map(|slot| field.point(slot)).collect();
@@ -123,6 +155,20 @@ proptest! {
                 for quadtree in [closed, own] {
                     let found = largest_error(&ground, criterion, &quadtree);
                     prop_assert!(found <= tolerance, "quadtree, {criterion:?} {strategy} {found} {tolerance}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_descent_finds_what_a_plain_one_does(field in any_field(), part in 0.0f64..0.6, share in 0.0f64..=1.0, masked in any::<bool>()) {
+        let weights: Vec<f32> = (0..SIDE * SIDE).map(|s| [1.0, 0.25, 0.0][s % 3]).collect();
+        let ground = Ground::new(&field, masked.then_some(&weights[..])).unwrap();
+        for criterion in [Criterion::Vertical, Criterion::Euclidean, Criterion::Curvature, Criterion::Normal, Criterion::Coefficient] {
+            for tolerance in [0.0, part * scale(&ground, criterion)] {
+                for share in [0.0, share, 1.0] {
+                    let plain = descend_plainly(&ground, criterion, tolerance, share);
+                    prop_assert!(top_down(&ground, criterion, tolerance, share) == plain, "{criterion:?} {tolerance} {share}");
                 }
             }
         }
