@@ -124,9 +124,8 @@ impl Facet {
 
     /// Its left or right half, if it is split at its middle `m`, which is so high.
     fn half(&self, is_right: bool, m: Point, height: f64) -> Self {
-        let [ha, hc, hb] = self.heights;
         let (path, corners) = split(self.path, self.corners, m)[usize::from(is_right)];
-        Self { path, corners, heights: if is_right { [hb, height, hc] } else { [hc, height, ha] } }
+        Self { path, corners, heights: half_heights(is_right, self.heights, height) }
     }
 }
 
@@ -225,7 +224,7 @@ impl Bitree {
         let slot = self.slot(point);
         let before = std::mem::replace(&mut self.real[slot], height);
         if before.is_nan() {
-            self.count(point, 1);
+            self.count(self.around(point), 1);
             return None;
         }
         Some(before)
@@ -233,16 +232,32 @@ impl Bitree {
 
     /// Takes a point out of the selection; gives back its height. The corners stay.
     pub fn remove(&mut self, point: Point) -> Option<f64> {
+        self.remove_if(point, |_| ControlFlow::Continue(()))
+    }
+
+    /// Takes a point out of the selection if `visit` does not break: it is called with each triangle that is drawn otherwise
+    /// then, as it is then. Gives back the point's height if it is gone. The corners stay.
+    pub fn remove_if(
+        &mut self,
+        point: Point,
+        mut visit: impl FnMut(&Facet) -> ControlFlow<()>,
+    ) -> Option<f64> {
         let height = self.real(point).filter(|_| self.level(point) != Some(0))?;
+        let around = self.around(point);
+        for facet in around.iter().flatten() {
+            if self.changes_without_middle(facet, &mut visit).is_break() {
+                return None;
+            }
+        }
         let slot = self.slot(point);
         self.real[slot] = f64::NAN;
-        self.count(point, u32::MAX);
+        self.count(around, u32::MAX);
         Some(height)
     }
 
-    /// Adds `change` (modulo 2^32) along the paths to the triangles that have the point as their middle.
-    fn count(&mut self, point: Point, change: u32) {
-        for facet in self.around(point).into_iter().flatten() {
+    /// Adds `change` (modulo 2^32) along the paths to triangles.
+    fn count(&mut self, to: [Option<Facet>; 2], change: u32) {
+        for facet in to.into_iter().flatten() {
             let mut path = facet.path;
             while path > 1 {
                 let count = &mut self.below[path as usize];
@@ -342,7 +357,7 @@ impl Bitree {
 
     /// The triangles that would be drawn otherwise, of those at or below one, were its middle not real: as they would be
     /// then. Most of what is below hangs on other points. Calls `visit` with each, until it breaks.
-    pub fn changes_without_middle(
+    fn changes_without_middle(
         &self,
         from: &Facet,
         visit: &mut impl FnMut(&Facet) -> ControlFlow<()>,
@@ -352,11 +367,8 @@ impl Bitree {
         }
         let (m, height) = self.middle(from);
         for is_right in [false, true] {
-            self.changes(
-                &from.half(is_right, m, height),
-                from.half(is_right, m, from.mean()).heights,
-                visit,
-            )?;
+            let half = from.half(is_right, m, height);
+            self.changes(&half, half_heights(is_right, from.heights, from.mean()), visit)?;
         }
         ControlFlow::Continue(())
     }
@@ -375,8 +387,12 @@ impl Bitree {
         if !self.is_split(from) {
             return visit(&changed);
         }
-        for (half, changed) in self.halves(from).iter().zip(self.halves(&changed)) {
-            self.changes(half, changed.heights, visit)?;
+        let (m, height) = self.middle(from);
+        let is_fictitious = self.real[self.slot(m)].is_nan();
+        let to_height = if is_fictitious { changed.mean() } else { height };
+        for is_right in [false, true] {
+            let half = from.half(is_right, m, height);
+            self.changes(&half, half_heights(is_right, to, to_height), visit)?;
         }
         ControlFlow::Continue(())
     }
@@ -485,6 +501,11 @@ fn is_left([_, c, _]: [Point; 3], m: Point, place: [i32; 2]) -> bool {
 /// Path and corners of both halves, left then right.
 fn split(path: u32, [a, c, b]: [Point; 3], m: Point) -> [(u32, [Point; 3]); 2] {
     [(path << 1, [c, m, a]), (path << 1 | 1, [b, m, c])]
+}
+
+/// Heights of the corners of one half, if the middle is so high.
+fn half_heights(is_right: bool, [ha, hc, hb]: [f64; 3], height: f64) -> [f64; 3] {
+    if is_right { [hb, height, hc] } else { [hc, height, ha] }
 }
 
 fn middle([a, _, b]: [Point; 3]) -> Point {

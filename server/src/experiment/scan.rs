@@ -99,6 +99,37 @@ pub fn vertical_error(
     worst
 }
 
+/// Whether [`vertical_error`] is more than a tolerance, the samples that tell it most often first.
+#[must_use]
+pub fn exceeds(
+    field: &Field,
+    weights: Option<&[f32]>,
+    corners: [Point; 3],
+    heights: [f64; 3],
+    tolerance: f64,
+) -> bool {
+    let is_off = |p: Point, height: f64| {
+        let slot = field.slot(p);
+        weights.map_or(1.0, |w| f64::from(w[slot])) * (field.heights()[slot] - height).abs() > tolerance
+    };
+    let ([a, c, b], [ha, hc, hb]) = (corners, heights);
+    if is_off(a, ha) || is_off(c, hc) || is_off(b, hb) {
+        return true;
+    }
+    // Middles of sides lie on the grid, or the triangle has no more samples.
+    for ((p, hp), (q, hq)) in [((a, ha), (b, hb)), ((a, ha), (c, hc)), ((c, hc), (b, hb))] {
+        if (p[0] ^ q[0] | p[1] ^ q[1]) & 1 == 1 {
+            return false;
+        }
+        if is_off([p[0].midpoint(q[0]), p[1].midpoint(q[1])], (hp + hq) / 2.0) {
+            return true;
+        }
+    }
+    // With these the smallest triangle with three middles is complete.
+    let is_small = c[0].abs_diff(a[0]) + c[1].abs_diff(a[1]) == 2 && (c[0] == a[0] || c[1] == a[1]);
+    !is_small && vertical_error(field, weights, corners, heights, tolerance) > tolerance
+}
+
 /// The height of a bitree's surface at each sample, data or not.
 #[must_use]
 pub fn surface(field: &Field, tree: &Bitree) -> Vec<f64> {
@@ -203,6 +234,10 @@ mod tests {
                 });
                 let found = vertical_error(&field, weights, facet.corners(), facet.heights(), f64::INFINITY);
                 assert_eq!(found, expected);
+                for (tolerance, is_more) in [(expected, false), (0.9 * expected, expected > 0.0)] {
+                    let told = exceeds(&field, weights, facet.corners(), facet.heights(), tolerance);
+                    assert_eq!(told, is_more, "{tolerance}");
+                }
             }
             for (corner, height) in facet.corners().into_iter().zip(facet.heights()) {
                 assert_eq!(Plane::new(facet.corners(), facet.heights()).at(corner), height);

@@ -3,7 +3,7 @@
 use super::Strategy;
 use crate::experiment::curvature::curvatures;
 use crate::experiment::field::Field;
-use crate::experiment::scan::{Plane, rows, vertical_error};
+use crate::experiment::scan::{Plane, exceeds, rows, vertical_error};
 use diamantina_protocol::bintree::Point;
 use diamantina_protocol::bitree::{Bitree, Facet};
 use std::ops::ControlFlow;
@@ -127,7 +127,7 @@ impl Criterion {
     ) -> bool {
         let field = ground.field;
         let error = match self {
-            Self::Vertical => vertical_error(field, ground.weights, corners, heights, tolerance),
+            Self::Vertical => return exceeds(field, ground.weights, corners, heights, tolerance),
             Self::Euclidean => euclidean_error(ground, corners, heights, tolerance),
             Self::Curvature | Self::Normal | Self::Coefficient => Facet::new(field.log2(), corners, heights)
                 .map_or(0.0, |facet| self.error(ground, &facet, tolerance)),

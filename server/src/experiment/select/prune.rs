@@ -8,7 +8,7 @@
 use super::top_down::diamonds;
 use super::{Criterion, Ground};
 use diamantina_protocol::bintree::Point;
-use diamantina_protocol::bitree::Bitree;
+use diamantina_protocol::bitree::{Bitree, Facet};
 use std::ops::ControlFlow;
 
 /// Times that points are tried: later passes find a handful.
@@ -30,18 +30,19 @@ pub(super) fn prune_among(
 ) {
     // The finest first, and row by row.
     may_go.sort_unstable_by_key(|p| (std::cmp::Reverse(tree.level(*p)), p[1], p[0]));
+    let within = |leaf: &Facet| match criterion.exceeds(ground, leaf.corners(), leaf.heights(), tolerance) {
+        true => ControlFlow::Break(()),
+        false => ControlFlow::Continue(()),
+    };
     let mut last: Option<Areas> = None;
     for pass in 1..=PASSES_MAX {
         let mut removed = Areas::new(tree.log2());
         for point in may_go {
-            if has_to_stay(ground, criterion, tolerance, tree, point) {
-                continue;
-            }
             // Where nothing has changed since it was tried, it would stay again.
-            let is_tried = last.as_ref().is_some_and(|last| !last.overlap(point) && !removed.overlap(point));
+            let is_tried = last.as_ref().is_some_and(|last| !last.overlap(point)) && !removed.overlap(point);
             if !is_tried
-                && is_good_without(ground, criterion, tolerance, tree, point)
-                && tree.remove(point).is_some()
+                && !has_to_stay(ground, criterion, tolerance, tree, point)
+                && tree.remove_if(point, within).is_some()
             {
                 removed.insert(point);
             }
@@ -50,6 +51,7 @@ pub(super) fn prune_among(
             return;
         }
         may_go = real_points(tree);
+        removed.complete();
         last = Some(removed);
     }
 }
@@ -79,83 +81,77 @@ fn real_points(tree: &Bitree) -> Vec<Point> {
     points
 }
 
-/// Whether all that would be drawn otherwise without a point would be within the tolerance.
-fn is_good_without(
-    ground: &Ground<'_>,
-    criterion: Criterion,
-    tolerance: f64,
-    tree: &Bitree,
-    point: Point,
-) -> bool {
-    let within =
-        |found: f64| if found > tolerance { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
-    tree.around(point).into_iter().flatten().all(|facet| {
-        let visit = &mut |leaf: &_| within(criterion.error(ground, leaf, tolerance));
-        tree.changes_without_middle(&facet, visit).is_continue()
-    })
-}
-
 /// The squares around points that reach as far as the triangles in whose middle these stand: 2^z cells to each side,
-/// z being the number of times that both coordinates can be halved. So they lie on the lattice of that step.
+/// z being the number of times that both coordinates can be halved. So each is four cells of the lattice of that step.
 struct Areas {
     log2: u8,
-    /// By z: the cells of 2^z that are covered by squares of this and finer steps, and by those of this step alone.
-    cells: Vec<[Vec<u64>; 2]>,
+    /// By z and cell of 2^z: whether squares of this step cover it, finer ones lie in it, or coarser ones cover it.
+    cells: Vec<Vec<u8>>,
 }
+
+const OWN: u8 = 1;
+const FINER: u8 = 2;
+const COARSER: u8 = 4;
 
 impl Areas {
     fn new(log2: u8) -> Self {
-        let words = |z: u8| (1usize << (2 * (log2 - z))).div_ceil(64);
-        let cells = (0..=log2).map(|z| [vec![0; words(z)], vec![0; words(z)]]).collect();
+        let cells = (0..=log2).map(|z| vec![0; 1 << (2 * (log2 - z))]).collect();
         Self { log2, cells }
     }
 
     fn is_empty(&self) -> bool {
         // Every square lies in the one cell as large as the grid.
-        self.cells.last().is_none_or(|[upto, _]| upto.iter().all(|word| *word == 0))
+        self.cells.last().is_none_or(|whole| *whole == [0])
     }
 
     fn insert(&mut self, point: Point) {
-        let own = zeros(point);
-        for z in own..=u32::from(self.log2) {
-            for cell in cells(self.log2, point, own, z) {
-                let bit = 1 << (cell % 64);
-                let [upto, exact] = &mut self.cells[z as usize];
-                upto[cell / 64] |= bit;
-                if z == own {
-                    exact[cell / 64] |= bit;
+        for mut cell in self.square(point) {
+            let mut z = zeros(point);
+            self.cells[z][cell] |= OWN;
+            while z < usize::from(self.log2) {
+                let row = usize::from(self.log2) - z;
+                let [x, y] = [cell & ((1 << row) - 1), cell >> row];
+                (z, cell) = (z + 1, (y >> 1 << (row - 1)) + (x >> 1));
+                if self.cells[z][cell] & FINER != 0 {
+                    break;
+                }
+                self.cells[z][cell] |= FINER;
+            }
+        }
+    }
+
+    /// Whether the square around a point shares a cell with any of them that is no coarser; once they are complete, with any.
+    fn overlap(&self, point: Point) -> bool {
+        self.square(point).any(|cell| self.cells[zeros(point)][cell] != 0)
+    }
+
+    /// No more points come: tells finer cells of the coarser squares over them, too.
+    fn complete(&mut self) {
+        for z in (1..=self.log2.into()).rev() {
+            let row = usize::from(self.log2) - z;
+            for cell in 0..self.cells[z].len() {
+                if self.cells[z][cell] & (OWN | COARSER) != 0 {
+                    let [x, y] = [cell & ((1 << row) - 1), cell >> row];
+                    for below in [2 * y, 2 * y + 1].map(|y| (y << (row + 1)) + 2 * x) {
+                        self.cells[z - 1][below] |= COARSER;
+                        self.cells[z - 1][below + 1] |= COARSER;
+                    }
                 }
             }
         }
     }
 
-    /// Whether the square around a point shares a cell with any of them.
-    fn overlap(&self, point: Point) -> bool {
-        let own = zeros(point).min(u32::from(self.log2));
-        (own..=u32::from(self.log2)).any(|z| {
-            let [upto, exact] = &self.cells[z as usize];
-            let covered = if z == own { upto } else { exact };
-            cells(self.log2, point, own, z).any(|cell| covered[cell / 64] >> (cell % 64) & 1 == 1)
-        })
+    /// The cells of a point's square that are on the grid.
+    fn square(&self, point: Point) -> impl Iterator<Item = usize> + use<> {
+        let z = zeros(point);
+        let row = 1usize << (usize::from(self.log2) - z);
+        let [x, y] = point.map(|w| w as usize >> z);
+        let pair = move |w: usize| [w.checked_sub(1), (w < row).then_some(w)].into_iter().flatten();
+        pair(y).flat_map(move |y| pair(x).map(move |x| y * row + x))
     }
 }
 
 /// The times that both coordinates can be halved.
-fn zeros([x, y]: Point) -> u32 {
-    (x | y).trailing_zeros()
-}
-
-/// The numbers of the cells of 2^z, on a grid, in which the square of 2^`own` cells to each side of a point lies, z being
-/// no less than `own`; some twice.
-fn cells(log2: u8, [x, y]: Point, own: u32, z: u32) -> impl Iterator<Item = usize> {
-    let side = 1usize << log2;
-    // By the middles of the square's quarters.
-    let along = move |w: u32, forth: bool| {
-        let middle = 2 * w as usize + (usize::from(forth) << (own + 1));
-        let middle = middle.checked_sub(1 << own)?;
-        (middle < 2 * side).then_some(middle >> (z + 1))
-    };
-    [(false, false), (true, false), (false, true), (true, true)]
-        .into_iter()
-        .filter_map(move |(east, north)| Some((along(y, north)? * (side >> z)) + along(x, east)?))
+fn zeros([x, y]: Point) -> usize {
+    (x | y).trailing_zeros() as usize
 }
