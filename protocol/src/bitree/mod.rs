@@ -32,6 +32,9 @@ use std::ops::ControlFlow;
 /// The largest grid: 2^12 + 1 points a side; 134 MB of counts and as much of heights.
 pub const LOG2_MAX: u8 = 12;
 
+/// Means of means that are worked out from real points around; more is found along the way from the top.
+const NEAR: u32 = 3;
+
 /// What a grid point is in a bitree.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Presence {
@@ -72,17 +75,10 @@ impl Facet {
             return None;
         }
         let [a, c, b] = corners;
-        // Halfway between the apex and the middle: four times as far along both axes.
-        let inside = [0, 1].map(|i| (a[i] + 2 * c[i] + b[i]).cast_signed());
-        let [lower, upper] = root_corners(log2);
-        let (mut path, mut at) = if inside[0] > inside[1] { lower } else { upper };
-        for _ in 0..2 * log2 {
-            if at == corners {
-                break;
-            }
-            let m = middle(at);
-            (path, at) = split(path, at, m)[usize::from(!is_left(at, m, inside))];
-        }
+        // The square of the hypotenuse halves from level to level.
+        let square = a[0].abs_diff(b[0]).pow(2) + a[1].abs_diff(b[1]).pow(2);
+        let level = (2 * u32::from(log2) + 1).checked_sub(square.checked_ilog2()?)?;
+        let (path, at) = descend(log2, inside([a, c, b]), level);
         (at == corners).then_some(Self { path, corners, heights })
     }
 
@@ -271,31 +267,35 @@ impl Bitree {
     /// the corners and outside of the grid. Costs one step a level.
     #[must_use]
     pub fn around(&self, point: Point) -> [Option<Facet>; 2] {
-        let Some(level) = self.level(point).filter(|l| *l > 0) else { return [None; 2] };
-        // A step from the point that leads into one of them, and its opposite into the other. Beside the
-        // centre of a square the triangles lie to the left and right whichever diagonal it has.
+        let Some([a, b]) = hypotenuse(self.log2, point) else { return [None; 2] };
+        let level = level(self.log2, point) - 1;
+        // Seen from the middle, the apex lies where the end a does, turned left by a quarter.
         let [x, y] = point;
-        let zeros = (x | y).trailing_zeros();
-        let [dx, dy] = if (x >> zeros) & 1 == 1 && (y >> zeros) & 1 == 0 { [0, 1] } else { [1, 0] };
-        [1, -1].map(|sign| {
-            let probe = [4 * x.cast_signed() + sign * dx, 4 * y.cast_signed() + sign * dy];
-            self.descend(probe, level - 1)
-        })
+        let apex = |a: Point| [(x + y).wrapping_sub(a[1]), (y + a[0]).wrapping_sub(x)];
+        // First the triangle to the east, or else to the north.
+        let is_first = (y, a[0]) > (a[1], x);
+        let ways = if is_first { [[a, b], [b, a]] } else { [[b, a], [a, b]] };
+        ways.map(|[a, b]| self.inside(apex(a)).then(|| self.at([a, apex(a), b], level)))
     }
 
-    /// The triangle of a level that has a place, in quarters of cells, strictly inside.
-    fn descend(&self, place: [i32; 2], level: u32) -> Option<Facet> {
-        let end = 4 << self.log2;
-        if place.iter().any(|v| !(0..=end).contains(v)) {
-            return None;
+    /// The triangle with these corners, of that level.
+    fn at(&self, corners: [Point; 3], level: u32) -> Facet {
+        let (path, corners) = descend(self.log2, inside(corners), level);
+        let [Some(ha), Some(hc), Some(hb)] = corners.map(|p| self.near(p, NEAR)) else {
+            // One hangs on many others: along the way to it each height is found once.
+            return self.facet(path).unwrap_or(Facet { path, corners, heights: [f64::NAN; 3] });
+        };
+        Facet { path, corners, heights: [ha, hc, hb] }
+    }
+
+    /// The height of the surface at a point, if it follows from real ones in so many steps.
+    fn near(&self, point: Point, steps: u32) -> Option<f64> {
+        let own = self.real[self.slot(point)];
+        if !own.is_nan() {
+            return Some(own);
         }
-        let [lower, upper] = self.roots();
-        let mut at = if place[0] > place[1] { lower } else { upper };
-        for _ in 0..level {
-            let (m, height) = self.middle(&at);
-            at = at.half(!is_left(at.corners, m, place), m, height);
-        }
-        Some(at)
+        let [a, b] = hypotenuse(self.log2, point).filter(|_| steps > 0)?;
+        Some((self.near(a, steps - 1)? + self.near(b, steps - 1)?) / 2.0)
     }
 
     /// The two halves of the grid.
@@ -316,7 +316,8 @@ impl Bitree {
         let level = path.ilog2() - 1;
         let mut facet = self.roots()[(path >> level & 1) as usize];
         for step in (0..level).rev() {
-            facet = self.halves(&facet)[(path >> step & 1) as usize];
+            let (m, height) = self.middle(&facet);
+            facet = facet.half(path >> step & 1 == 1, m, height);
         }
         Some(facet)
     }
@@ -388,8 +389,7 @@ impl Bitree {
             return visit(&changed);
         }
         let (m, height) = self.middle(from);
-        let is_fictitious = self.real[self.slot(m)].is_nan();
-        let to_height = if is_fictitious { changed.mean() } else { height };
+        let (_, to_height) = self.middle(&changed);
         for is_right in [false, true] {
             let half = from.half(is_right, m, height);
             self.changes(&half, half_heights(is_right, to, to_height), visit)?;
@@ -401,12 +401,10 @@ impl Bitree {
     /// hypotenuse. `None` as of [`hypotenuse`].
     #[must_use]
     pub fn height_without(&self, point: Point) -> Option<f64> {
-        let [a, b] = hypotenuse(self.log2, point)?.map(|end| self.real[self.slot(end)]);
-        let mean = (a + b) / 2.0;
-        if !mean.is_nan() {
-            return Some(mean);
+        let [a, b] = hypotenuse(self.log2, point)?.map(|end| self.near(end, NEAR));
+        if let (Some(a), Some(b)) = (a, b) {
+            return Some((a + b) / 2.0);
         }
-        // An end is fictitious itself.
         self.around(point).into_iter().flatten().next().map(|facet| facet.mean())
     }
 
@@ -489,6 +487,22 @@ fn outermost(log2: u8) -> [Point; 4] {
 fn root_corners(log2: u8) -> [(u32, [Point; 3]); 2] {
     let [sw, se, ne, nw] = outermost(log2);
     [(2, [sw, se, ne]), (3, [ne, nw, sw])]
+}
+
+/// A place in a triangle, halfway between its apex and its middle, in quarters of cells.
+fn inside([a, c, b]: [Point; 3]) -> [i32; 2] {
+    [0, 1].map(|i| (a[i] + 2 * c[i] + b[i]).cast_signed())
+}
+
+/// Path and corners of the triangle of a level that has a place, in quarters of cells, strictly inside.
+fn descend(log2: u8, place: [i32; 2], level: u32) -> (u32, [Point; 3]) {
+    let [lower, upper] = root_corners(log2);
+    let (mut path, mut at) = if place[0] > place[1] { lower } else { upper };
+    for _ in 0..level {
+        let m = middle(at);
+        (path, at) = split(path, at, m)[usize::from(!is_left(at, m, place))];
+    }
+    (path, at)
 }
 
 /// Whether a place, in quarters of cells, is on the left half's side of the line from a triangle's apex to its middle.
