@@ -116,7 +116,7 @@ pub fn exceeds(
     if is_off(a, ha) || is_off(c, hc) || is_off(b, hb) {
         return true;
     }
-    // Middles of sides lie on the grid, or the triangle has no more samples.
+    // Middles of sides lie on the grid, or the triangle has no more samples. Means are exact, as the plane is.
     for ((p, hp), (q, hq)) in [((a, ha), (b, hb)), ((a, ha), (c, hc)), ((c, hc), (b, hb))] {
         if (p[0] ^ q[0] | p[1] ^ q[1]) & 1 == 1 {
             return false;

@@ -85,12 +85,15 @@ fn real_points(tree: &Bitree) -> Vec<Point> {
 /// z being the number of times that both coordinates can be halved. So each is four cells of the lattice of that step.
 struct Areas {
     log2: u8,
-    /// By z and cell of 2^z: whether squares of this step cover it, finer ones lie in it, or coarser ones cover it.
+    /// By z and cell of 2^z, in bits.
     cells: Vec<Vec<u8>>,
 }
 
+/// A square of this step covers the cell.
 const OWN: u8 = 1;
+/// Squares of finer steps lie in it.
 const FINER: u8 = 2;
+/// Squares of coarser steps cover it.
 const COARSER: u8 = 4;
 
 impl Areas {
@@ -120,7 +123,8 @@ impl Areas {
         }
     }
 
-    /// Whether the square around a point shares a cell with any of them that is no coarser; once they are complete, with any.
+    /// Whether the square around a point shares a cell with any of them that is no coarser, in a pass that comes from the finest
+    /// with all there are; once they are complete, with any.
     fn overlap(&self, point: Point) -> bool {
         self.square(point).any(|cell| self.cells[zeros(point)][cell] != 0)
     }
