@@ -53,12 +53,6 @@ pub const MOTIONS_MAX: usize = 512;
 /// Motions that begin in one frame, for each layer; up to half a millisecond each. The others begin in the next one.
 pub const STARTS_MAX: usize = 64;
 
-/// Motions that begin in a second, for each layer, so that they take a tenth of it or so: 4 a frame, where there are 60.
-const STARTS_A_SECOND: f64 = 240.0;
-
-/// Motions that begin in one frame, however short it is.
-const STARTS_MIN: usize = 2;
-
 /// A moment, in ticks from a beginning that all moments of a scene share. Wraps around.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Moment(i32);
@@ -236,8 +230,6 @@ impl Cut {
 pub struct Morphs {
     duration: i32,
     motions_max: usize,
-    /// The moment of the last frame.
-    before: Option<Moment>,
     /// What the last frame drew as split.
     last: HashSet<Diamond, RandomState>,
     /// Those of diamonds with a point that moves.
@@ -275,7 +267,7 @@ impl Morphs {
     pub fn step(&mut self, change: &Change) -> Cut {
         let forest = change.layer.forest;
         self.motions.retain(|_, motion| motion.merging || !motion.is_over(change.now));
-        let mut starts = self.starts(change.now);
+        let mut starts = 0;
         let (mut order, mut waiting) = (Vec::with_capacity(change.wanted.len()), Vec::new());
         let mut set = Set::default();
         for d in change.wanted.iter().copied() {
@@ -300,15 +292,6 @@ impl Morphs {
         let cut = Cut { shown: shown.collect(), waiting, held: held.len() };
         self.last = set;
         cut
-    }
-
-    /// How many motions may begin in this frame.
-    fn starts(&mut self, now: Moment) -> usize {
-        let before = self.before.replace(now);
-        let seconds = before.map_or(0.0, |before| f64::from(now.since(before)) / TICKS_A_SECOND);
-        #[allow(clippy::cast_sign_loss, reason = "moments run forward")]
-        let starts = (seconds * STARTS_A_SECOND) as usize;
-        starts.clamp(STARTS_MIN, STARTS_MAX)
     }
 
     /// Begins or turns the motion of a wanted diamond whose parents are drawn as split, where there is something
@@ -380,7 +363,7 @@ impl Morphs {
 
     fn start(&mut self, change: &Change, d: Diamond, way: Way, starts: &mut usize) -> bool {
         let is_full = self.motions.len() >= self.motions_max && !self.motions.contains_key(&d);
-        if *starts == 0 || is_full {
+        if *starts >= STARTS_MAX || is_full {
             return false;
         }
         let Some(resident) = (change.surface)(d) else { return false };
@@ -403,7 +386,7 @@ impl Morphs {
         };
         let declared = (change.sight)(d).error_metres;
         let motion = start.motion(way, declared, change.layer.quantum);
-        *starts -= 1;
+        *starts += 1;
         if way != Way::Home && !motion.records.iter().any(Record::moves) {
             self.motions.remove(&d);
             return true;

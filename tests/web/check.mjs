@@ -254,7 +254,7 @@ for (const graphics of ['webgpu', 'webgl']) {
     const args = [...COMMON, ...FLAGS[graphics]];
     const browser = await chromium.launch({ executablePath, headless: true, args });
     try {
-        const context = await browser.newContext({ viewport: SIZE, deviceScaleFactor: 1 });
+        const context = await browser.newContext({ viewport: SIZE, deviceScaleFactor: 1, hasTouch: true });
         const [page, blank] = [await context.newPage(), await context.newPage()];
         const wrong = [];
         let allowed = null;

@@ -41,7 +41,7 @@ impl History {
     }
 
     /// Frames a second, over the last ones of half a second together, or the last one.
-    fn rate(&self) -> Option<f32> {
+    pub(super) fn rate(&self) -> Option<f32> {
         let (mut count, mut sum) = (0.0, 0.0);
         for milliseconds in self.milliseconds.iter().rev() {
             count += 1.0;
