@@ -401,17 +401,7 @@ fn two_fingers_turn_what_is_between_them() {
 fn boxes_are_drawn_around_what_is_drawn() {
     let mut hand = Hand::new(None);
     let lines = |hand: &mut Hand| {
-        let input = RawInput {
-            screen_rect: Some(Rect::from_min_size(Pos2::ZERO, vec2(SIZE[0] as f32, SIZE[1] as f32))),
-            time: Some(hand.seconds + 1.0),
-            ..RawInput::default()
-        };
-        let viewer = &mut hand.viewer;
-        let output = hand.context.run_ui(input, |ui| viewer.update(ui));
-        let lines =
-            output.shapes.iter().filter(|s| matches!(s.shape, egui::Shape::LineSegment { .. })).count();
-        output.drop_without_applying_deltas();
-        lines
+        shapes(hand).iter().filter(|shape| matches!(shape, egui::Shape::LineSegment { .. })).count()
     };
     let without = lines(&mut hand);
     hand.viewer.shows_boxes = true;
@@ -529,18 +519,6 @@ fn slow_frames_are_told_and_messages_go() {
 fn what_was_clicked_is_marked_in_the_picture() {
     let mut hand = Hand::new(Some(looking_down()));
     let [a, b] = hand.solid();
-    let shapes = |hand: &mut Hand| {
-        let input = RawInput {
-            screen_rect: Some(Rect::from_min_size(Pos2::ZERO, vec2(SIZE[0] as f32, SIZE[1] as f32))),
-            time: Some(hand.seconds + 1.0),
-            ..RawInput::default()
-        };
-        let viewer = &mut hand.viewer;
-        let output = hand.context.run_ui(input, |ui| viewer.update(ui));
-        let shapes: Vec<egui::Shape> = output.shapes.iter().map(|shape| shape.shape.clone()).collect();
-        output.drop_without_applying_deltas();
-        shapes
-    };
     let near = |shapes: &[egui::Shape], at: Pos2| {
         shapes.iter().any(|s| matches!(s, egui::Shape::Circle(c) if c.center.distance(at) < 1.5))
     };
@@ -578,6 +556,20 @@ fn a_new_version_is_noticed_while_nothing_is_missing() {
         assert!(Instant::now() < until);
         std::thread::sleep(Duration::from_millis(2));
     }
+}
+
+/// What is drawn over the picture in a frame.
+fn shapes(hand: &mut Hand) -> Vec<egui::Shape> {
+    let input = RawInput {
+        screen_rect: Some(Rect::from_min_size(Pos2::ZERO, vec2(SIZE[0] as f32, SIZE[1] as f32))),
+        time: Some(hand.seconds + 1.0),
+        ..RawInput::default()
+    };
+    let viewer = &mut hand.viewer;
+    let output = hand.context.run_ui(input, |ui| viewer.update(ui));
+    let shapes = output.shapes.iter().map(|shape| shape.shape.clone()).collect();
+    output.drop_without_applying_deltas();
+    shapes
 }
 
 /// What is written in a frame, and where.
