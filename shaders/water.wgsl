@@ -117,17 +117,16 @@ fn water_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
     back = normalize(vec3<f32>(back.xy, abs(back.z)));
     var image = projected(vec3<f32>(back.xy, -back.z) * 1e6);
     // Past a shore the mirrored picture shows what is behind the bank, whose foot is clipped: there the still surface's
-    // is nearer to the truth. The more the higher the bank is, or waves would cut what is mirrored into scales.
+    // is nearer to the truth.
     let inside = clamp(image.xy, vec2<f32>(0.0), vec2<f32>(1.0));
     let beyond = ray_through(inside);
     let bank = beyond.z * scene_distance(inside, dot(beyond, frame.forward.xyz));
-    let is_bank = image.z > 0.0 && bank < 1e9;
-    let banked = select(0.0, smoothstep(0.002, 0.04, (bank - p.z) / distance), is_bank);
-    let bent_picture = textureSampleLevel(mirrored, smooth_sampler, image.xy, 0.0);
-    let still_picture = textureSampleLevel(mirrored, smooth_sampler, here, 0.0);
-    let found = mix(bent_picture, still_picture, banked);
+    if image.z > 0.0 && bank > p.z + 0.002 * distance && bank < 1e9 {
+        image = vec3<f32>(here, 1.0);
+    }
+    let found = textureSampleLevel(mirrored, smooth_sampler, image.xy, 0.0);
     // Past the edges nothing was drawn.
-    let lost = (1.0 - banked) * select(1.0, smoothstep(0.0, 0.1, outside(image.xy)), image.z > 0.0);
+    let lost = select(1.0, smoothstep(0.0, 0.1, outside(image.xy)), image.z > 0.0);
     // Still water mirrors the sun's disc, where alpha says that there is sky; waves break it into the glitter below.
     let angle = 2.0 * length(frame.up.xyz) / f32(textureDimensions(scene).y);
     let is_open = 1.0 - mix(found.a, 0.0, lost);

@@ -447,7 +447,7 @@ fn irregular_triangles_that_are_damaged_are_refused_and_fetched_again() {
 /// A checksum does not help against a server that means it.
 #[test]
 fn hostile_triangles_are_refused() {
-    let served = Served::start(1, Faults { forged: 0.04, ..Faults::default() });
+    let served = Served::start(1, Faults { forged: 0.1, ..Faults::default() });
     let mut terrain = open(&served, tin_options());
     let view = terrain.settle(&above(), MINUTE);
     assert!(view.complete, "{:?}", terrain.problem());
