@@ -81,9 +81,11 @@ fmt:
 clippy:
 	@$(step) clippy cargo clippy --locked --workspace --all-targets -- -D warnings
 
-# With the output of tests that pass: it says which of them had no data to work on.
+# With the output of tests that pass: it says which of them had no data to work on. Many wait, for links, ends and
+# timeouts, so there are two for each core; those that are held against the clock come afterwards, one by one.
 tests:
-	@$(step) tests cargo test --locked --workspace --no-fail-fast -- --show-output
+	@$(step) tests cargo test --locked --workspace --no-fail-fast -- --show-output --test-threads=$$((2 * $$(nproc))) --skip timed::
+	@$(step) timed cargo test --locked --workspace --test e2e -- --show-output --test-threads=1 timed::
 
 # What takes too long for each change. Each DEM is told as it is done.
 test-long: setup

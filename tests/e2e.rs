@@ -60,6 +60,8 @@ mod swap;
 mod textures;
 /// The house: who may import whom, how long a file may be.
 mod tidy;
+/// Frames that are timed.
+mod timed;
 /// Laws 2, 3, 6 and 7 for triangles: borders fit, declared errors hold, killed builds go on, and are served.
 mod tin;
 /// Triangles as the client draws them: no cracks, no seams of light, the same ground as points.

@@ -195,15 +195,3 @@ fn a_hole_would_be_seen() {
     let (picture, _) = headless::picture(&mut terrain, &camera, &over_magenta(), &sharp(), patience).unwrap();
     assert!(picture.pixels.chunks_exact(4).any(|p| p == MAGENTA));
 }
-
-#[test]
-fn a_frame_waits_for_nothing_while_the_network_hangs() {
-    let world = World::whole(1025);
-    let faults = Faults { stalled: 1.0, stall: Duration::from_secs(30), ..Faults::default() };
-    let (unfinished, cuts) = fly_over_magenta(&world, faults, 2, Encoding::Points);
-    assert!(unfinished > 30, "nothing hung: {unfinished} unfinished frames");
-    // Far below the 30 s of the network, far above a cut's own time: a busy machine may pause any thread.
-    let (common, slowest) = (cuts[cuts.len() * 95 / 100], cuts[cuts.len() - 1]);
-    let _ = writeln!(std::io::stderr(), "cut: 95 % within {common:.1} ms, all within {slowest:.1} ms");
-    assert!(common < 250.0 && slowest < 2000.0, "95 % within {common} ms, slowest {slowest} ms");
-}

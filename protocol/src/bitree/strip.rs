@@ -23,6 +23,9 @@
 //! The rules fix more than the path: the corners' order in each triangle, too, and with it where a side has to be turned
 //! round. [`shortest`] finds those orders that take the fewest references in all, along the path, and in small
 //! meshes along other paths, too.
+//!
+//! Graphics processors take every other triangle of a strip, line triangles counted, the other way round, so that neighbours
+//! show the same side. By the rules all triangles turn right then: with a reference twice at the beginning, left.
 
 use super::{Bitree, Facet};
 use crate::bintree::Point;
@@ -107,22 +110,37 @@ const ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2,
 /// The most triangles for which [`shortest`] looks for other paths: in larger meshes they gain one reference in a thousand.
 const SMALL: usize = 256;
 
+/// Which way round a strip's triangles are drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Winding {
+    /// All alike, every other one taken the other way round: so that they show the same side.
+    Kept,
+    /// Any way, for whoever draws both sides.
+    Free,
+}
+
 /// A strip that draws exactly the bitree's triangles in the order of the recursion, each with whichever order of its corners
 /// makes the whole shortest; of the recursion's four ways through a grid (from either end of the diagonal, and over to either
-/// side) the one for which that is least. Which way round a triangle is drawn is left open. By dynamic programming: the
-/// fewest references until a triangle, for each order of its corners, follow from those until the triangle before.
-/// Meshes of up to 256 triangles are also put together from their parts, either half of each triangle first.
+/// side) the one for which that is least. By dynamic programming: the fewest references until a triangle, for each order of
+/// its corners, follow from those until the triangle before. Meshes of up to 256 triangles are also put together from their
+/// parts, either half of each triangle first.
 ///
 /// Costs some 150 steps a triangle, a hundred times as many in small meshes, and 50 bytes of memory.
 #[must_use]
-pub fn shortest(bitree: &Bitree) -> Vec<Point> {
+pub fn shortest(bitree: &Bitree, winding: Winding) -> Vec<Point> {
     let ways = [[false, true], [false, false], [true, true], [true, false]].map(|from_b| {
         let mut triangles = Vec::with_capacity(bitree.triangle_count());
         path(bitree, from_b, &mut |pqr| triangles.push(pqr));
         triangles
     });
-    let free = (bitree.triangle_count() <= SMALL).then(|| Orders::default().of(bitree));
-    let strips = ways.into_iter().chain(free).map(|triangles| shortest_through(&triangles));
+    // What is best where all show the same side is not far off where any may be seen.
+    let windings: &[Winding] = match winding {
+        Winding::Kept => &[Winding::Kept],
+        Winding::Free => &[Winding::Free, Winding::Kept],
+    };
+    let windings = windings.iter().filter(|_| bitree.triangle_count() <= SMALL);
+    let others = windings.map(|winding| Orders { winding: *winding, joints: Vec::new() }.of(bitree));
+    let strips = ways.into_iter().chain(others).map(|triangles| shortest_through(&triangles, winding));
     strips.min_by_key(Vec::len).unwrap_or_default()
 }
 
@@ -147,8 +165,8 @@ enum Joint {
     Both([usize; 2]),
 }
 
-#[derive(Default)]
 struct Orders {
+    winding: Winding,
     joints: Vec<Joint>,
 }
 
@@ -190,8 +208,10 @@ impl Orders {
         let pairs = left.iter().flat_map(|l| right.iter().flat_map(move |r| [[l, r], [r, l]]));
         let mut found: Vec<_> = pairs
             .map(|[first, second]| {
-                let costs =
-                    chained(&chained(&first.costs, &links(first.ends[1], second.ends[0])), &second.costs);
+                let costs = chained(
+                    &chained(&first.costs, &self.links(first.ends[1], second.ends[0])),
+                    &second.costs,
+                );
                 (costs.iter().flatten().copied().min(), costs, [first, second])
             })
             .collect();
@@ -209,16 +229,17 @@ impl Orders {
         };
         found.into_iter().map(run).collect()
     }
+
+    /// References from one triangle to the next, by the orders of their corners.
+    fn links(&self, from: [Point; 3], to: [Point; 3]) -> Costs {
+        let ordered = |triangle: [Point; 3]| ORDERS.map(|order| order.map(|corner| triangle[corner]));
+        let count = |from, to| u32::try_from(link(from, to, self.winding).1).unwrap_or(FAR);
+        ordered(from).map(|from| ordered(to).map(|to| count(from, to)))
+    }
 }
 
 /// More than any strip has; three times that is a number still.
 const FAR: u32 = u32::MAX / 4;
-
-/// References from one triangle to the next, by the orders of their corners.
-fn links(from: [Point; 3], to: [Point; 3]) -> Costs {
-    let ordered = |triangle: [Point; 3]| ORDERS.map(|order| order.map(|corner| triangle[corner]));
-    ordered(from).map(|from| ordered(to).map(|to| u32::try_from(link(from, to).1).unwrap_or(FAR)))
-}
 
 /// The least costs of one run and then the next.
 fn chained(first: &Costs, second: &Costs) -> Costs {
@@ -234,7 +255,7 @@ fn chained(first: &Costs, second: &Costs) -> Costs {
 }
 
 /// The fewest references through triangles in their order.
-fn shortest_through(triangles: &[[Point; 3]]) -> Vec<Point> {
+fn shortest_through(triangles: &[[Point; 3]], winding: Winding) -> Vec<Point> {
     let ordered = |i: usize, order: usize| ORDERS[order].map(|corner| triangles[i][corner]);
     // By order: the fewest references so far; and of each triangle, the order before that led to them.
     let mut fewest = [3usize; 6];
@@ -243,7 +264,7 @@ fn shortest_through(triangles: &[[Point; 3]]) -> Vec<Point> {
         let mut next = [(usize::MAX, 0u8); 6];
         for (order, best) in next.iter_mut().enumerate() {
             for (last, so_far) in (0u8..).zip(fewest) {
-                let total = so_far + link(ordered(i - 1, last.into()), ordered(i, order)).1;
+                let total = so_far + link(ordered(i - 1, last.into()), ordered(i, order), winding).1;
                 *best = (*best).min((total, last));
             }
         }
@@ -263,16 +284,17 @@ fn shortest_through(triangles: &[[Point; 3]]) -> Vec<Point> {
         if i == 0 {
             out.extend(to);
         } else {
-            let (references, count) = link(ordered(i - 1, orders[i - 1]), to);
+            let (references, count) = link(ordered(i - 1, orders[i - 1]), to, winding);
             out.extend(&references[references.len() - count..]);
         }
     }
     out
 }
 
-/// The fewest references that lead from one triangle of a strip to another with nothing but lines between: of these five the
+/// The fewest references that lead from one triangle of a strip to another with nothing but lines between: of these six the
 /// last ones, as many as told.
-fn link([_, u, v]: [Point; 3], [p, q, r]: [Point; 3]) -> ([Point; 5], usize) {
+fn link(from: [Point; 3], [p, q, r]: [Point; 3], winding: Winding) -> ([Point; 6], usize) {
+    let [_, u, v] = from;
     let (goes_on_to_p, starts_towards_q) = (is_line([u, v, p]), is_line([v, p, q]));
     let count = match () {
         () if [u, v] == [p, q] => 1,
@@ -281,9 +303,15 @@ fn link([_, u, v]: [Point; 3], [p, q, r]: [Point; 3]) -> ([Point; 5], usize) {
         () if goes_on_to_p || starts_towards_q => 4,
         () => 5,
     };
-    // Twice the same reference makes two lines of whatever stands around it.
-    let second = if goes_on_to_p { p } else { v };
-    ([v, if count == 4 { second } else { p }, p, q, r], count)
+    // Each reference turns what comes next the other way round. Twice the same makes two lines of whatever stands around it.
+    let turns = is_left(from) != is_left([p, q, r]);
+    let once_more = winding == Winding::Kept && turns != (count % 2 == 1);
+    let total = count + usize::from(once_more);
+    let mut references = [p, p, p, p, q, r];
+    if count > 3 && !(count == 4 && goes_on_to_p) {
+        references[6 - total] = v;
+    }
+    (references, total)
 }
 
 /// The triangles with area that a strip draws, in its order.
@@ -299,9 +327,19 @@ pub fn line_triangles(strip: &[Point]) -> usize {
 }
 
 /// Whether three corners lie on one line.
-fn is_line([a, b, c]: [Point; 3]) -> bool {
+fn is_line(corners: [Point; 3]) -> bool {
+    doubled_area(corners) == 0
+}
+
+/// Whether three corners turn left.
+#[must_use]
+pub fn is_left(corners: [Point; 3]) -> bool {
+    doubled_area(corners) > 0
+}
+
+fn doubled_area([a, b, c]: [Point; 3]) -> i64 {
     let d = |p: Point, i: usize| i64::from(p[i]) - i64::from(a[i]);
-    d(b, 0) * d(c, 1) == d(b, 1) * d(c, 0)
+    d(b, 0) * d(c, 1) - d(b, 1) * d(c, 0)
 }
 
 #[cfg(test)]
@@ -328,16 +366,17 @@ mod tests {
     fn the_shortest_orders_of_small_grids_are_known() {
         // Two triangles share a side: nobody needs more than the four corners. Four around a centre: six at least.
         let square = Bitree::new(1, [0.0; 4]).unwrap();
-        assert_eq!((strip(&square).len(), shortest(&square).len()), (5, 4));
+        let lengths = |bitree: &Bitree| [Winding::Kept, Winding::Free].map(|w| shortest(bitree, w).len());
+        assert_eq!((strip(&square).len(), lengths(&square)), (5, [4, 4]));
         let mut four = square;
         four.add([1, 1], 1.0);
-        assert_eq!((strip(&four).len(), shortest(&four).len()), (7, 7));
+        assert_eq!((strip(&four).len(), lengths(&four)), (7, [7, 7]));
         // Six around a centre, on two of whose outer sides a point lies: nine, found by trying all strips.
         let mut six = Bitree::new(1, [0.0; 4]).unwrap();
         for p in [[1, 2], [0, 1], [1, 1]] {
             six.add(p, 1.0);
         }
-        assert_eq!((six.triangle_count(), shortest(&six).len()), (6, 9));
+        assert_eq!((six.triangle_count(), lengths(&six)), (6, [9, 9]));
     }
 
     proptest! {
@@ -355,10 +394,17 @@ mod tests {
             };
             let there = sorted(bitree.triangles().into_iter().map(|t| t.map(|(p, _)| p)).collect());
             let by_rules = strip(&bitree);
-            let short = shortest(&bitree);
-            prop_assert!(short.len() <= by_rules.len());
-            prop_assert_eq!(&sorted(triangles(&by_rules)), &there);
-            prop_assert_eq!(&sorted(triangles(&short)), &there);
+            let [kept, free] = [Winding::Kept, Winding::Free].map(|winding| shortest(&bitree, winding));
+            prop_assert!(free.len() <= kept.len() && kept.len() <= by_rules.len());
+            for strip in [&by_rules, &kept, &free] {
+                prop_assert_eq!(&sorted(triangles(strip)), &there);
+            }
+            for strip in [&by_rules, &kept] {
+                let areas = strip.array_windows().map(|corners| doubled_area(*corners)).enumerate();
+                let mut turns = areas.filter(|(_, area)| *area != 0).map(|(i, area)| (area > 0) == (i % 2 == 0));
+                let first = turns.next();
+                prop_assert!(turns.all(|turn| Some(turn) == first), "triangles show both sides");
+            }
         }
     }
 }

@@ -190,19 +190,21 @@ struct Here {
     /// Where the gate before it starts, and the one behind it ends.
     before: Placed,
     after: Placed,
+    /// Twice the areas of the gate's triangles with these two.
+    areas: [i64; 2],
 }
 
 impl Here {
-    /// Whether the corner at the gate's start leaves room for an edge to `v`.
+    /// Whether the corner at the gate's start leaves room for an edge to `v`, which lies to the left of the gate.
     #[inline(always)]
     fn start_has_room(&self, v: Point) -> bool {
-        inside(self.a.point, self.b.point, self.before.point, v)
+        (self.areas[0] <= 0) | (cross(self.a.point, v, self.before.point) > 0)
     }
 
     /// Whether the corner at the gate's end does.
     #[inline(always)]
     fn end_has_room(&self, v: Point) -> bool {
-        inside(self.b.point, self.after.point, self.a.point, v)
+        (self.areas[1] <= 0) | (cross(self.b.point, self.after.point, v) > 0)
     }
 }
 
@@ -285,6 +287,18 @@ fn inside(at: Point, from: Point, until: Point, to: Point) -> bool {
     // Without branches: which way a front turns is as random as the mesh, and would be mispredicted.
     let (left, right) = (after > 0, before > 0);
     (left & right) | ((turn <= 0) & (left | right))
+}
+
+/// [`inside`] of what is known to lie to the left of `from`, seen from `at`.
+#[inline(always)]
+fn is_left_inside(at: Point, from: Point, until: Point, to: Point) -> bool {
+    (cross(at, from, until) <= 0) | (cross(at, to, until) > 0)
+}
+
+/// [`inside`] of what is known to have `until` to its left.
+#[inline(always)]
+fn is_right_inside(at: Point, from: Point, until: Point, to: Point) -> bool {
+    (cross(at, from, until) <= 0) | (cross(at, from, to) > 0)
 }
 
 impl Walk {
@@ -420,7 +434,8 @@ impl Walk {
         let (prev, next) = (self.gate(gate.prev), self.gate(gate.next));
         let [a, b, before, after] = [gate.origin, next.origin, prev.origin, self.gate(next.next).origin]
             .map(|vertex| self.places[vertex as usize]);
-        Here { at, gate, prev, next, a, b, before, after }
+        let areas = [before, after].map(|v| cross(a.point, b.point, v.point));
+        Here { at, gate, prev, next, a, b, before, after, areas }
     }
 
     /// Settles what lies beyond a gate.
@@ -431,8 +446,8 @@ impl Walk {
         let beyond = pass.beyond(gate.mark);
         let alone = prev.prev == gate.next;
         let (before, behind) = (prev.state == State::Open, next.state == State::Open);
-        let left = angle(&here, &here.before, before & (!alone | behind));
-        let right = angle(&here, &here.after, behind & !alone);
+        let left = angle(&here, &here.before, here.areas[0], before & (!alone | behind));
+        let right = angle(&here, &here.after, here.areas[1], behind & !alone);
         if self.holes {
             let context =
                 usize::from(prev.state == State::Border) * 2 + usize::from(next.state == State::Border);
@@ -519,7 +534,7 @@ impl Walk {
         let (v, closes) = (prev.origin, prev.prev == gate.next);
         if !closes {
             let before = self.point(self.gate(prev.prev).origin);
-            let room = inside(apex.point, here.a.point, before, here.b.point);
+            let room = is_left_inside(apex.point, here.a.point, before, here.b.point);
             if !room || !here.end_has_room(apex.point) {
                 return Err(Fault::Place);
             }
@@ -543,7 +558,7 @@ impl Walk {
         let Here { gate, next, after: apex, .. } = *here;
         let beyond = self.gate(next.next);
         let after = self.point(self.gate(beyond.next).origin);
-        let room = inside(apex.point, after, here.b.point, here.a.point);
+        let room = is_right_inside(apex.point, after, here.b.point, here.a.point);
         if !room || !here.start_has_room(apex.point) {
             return Err(Fault::Place);
         }
@@ -636,11 +651,10 @@ impl Walk {
     }
 }
 
-/// The class of the angle at `v` of a gate's triangle, 0 if there can be none, or none is wanted.
+/// The class of the angle at `v` of a gate's triangle, 0 if there can be none, or none is wanted; `sine` is twice its area.
 #[inline(always)]
-fn angle(here: &Here, v: &Placed, wanted: bool) -> usize {
-    let (sine, cosine) =
-        (cross(here.a.point, here.b.point, v.point), dot(v.point, here.a.point, here.b.point));
+fn angle(here: &Here, v: &Placed, sine: i64, wanted: bool) -> usize {
+    let cosine = dot(v.point, here.a.point, here.b.point);
     let within = here.a.within.children & here.b.within.children & v.within.children;
     // 45 degrees, some 63, 90, 135. Without branches, as above.
     let class = 1
@@ -680,4 +694,25 @@ fn expected_height(a: Point, b: Point, behind: Option<Point>, x: i64, y: i64) ->
 
 fn index(count: usize) -> u32 {
     u32::try_from(count).unwrap_or(NONE)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn what_lies_on_the_known_side_is_inside_as_anything_is(xy in prop::array::uniform8(-4i32..=4)) {
+            let [at, from, until, to] = [0, 2, 4, 6].map(|i| Point { x: xy[i], y: xy[i + 1], height: 0 });
+            prop_assume!(difference(at, from) != [0, 0] && difference(at, until) != [0, 0]);
+            let expected = inside(at, from, until, to);
+            if cross(at, from, to) > 0 {
+                prop_assert_eq!(is_left_inside(at, from, until, to), expected);
+            }
+            if cross(at, to, until) > 0 {
+                prop_assert_eq!(is_right_inside(at, from, until, to), expected);
+            }
+        }
+    }
 }

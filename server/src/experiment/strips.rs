@@ -1,14 +1,16 @@
 //! References of triangle strips beside separate triangles, and beside other orders of the same triangles.
 //!
 //! *Strip* is the one strip of the recursion, by the rules. *Shortest* keeps its path and chooses the corners' order in each
-//! triangle. *Strips* are several, grown greedily from triangle to neighbour, with one restart reference between two. *Cached* is a list of separate triangles in the recursion's order,
+//! triangle; all show the same side, as they do in the strip by the rules, unless it is *of any winding*. *Strips* are several, grown greedily from triangle to neighbour, with one restart reference between two. *Cached* is a list of separate triangles in the recursion's order,
 //! told by the vertices that a first-in first-out cache of 32 has to fetch for it.
 
 use super::report::{Picture, Report, Table};
 use super::select::{Ground, scale, select};
 use super::{ExperimentError, Run, mean_and_spread, plot};
 use diamantina_protocol::bintree::Point;
+use diamantina_protocol::bitree::strip::Winding;
 use diamantina_protocol::bitree::{Bitree, strip};
+use std::cmp::Reverse;
 use std::collections::{BTreeMap, VecDeque};
 
 /// Vertices that the cache of a graphics processor is taken to hold.
@@ -28,6 +30,8 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
         "saved by the strip [%]",
         "shortest strip's references",
         "saved by the shortest strip [%]",
+        "references of the shortest of any winding",
+        "saved by that [%]",
         "strips",
         "strips' references",
         "saved by the strips [%]",
@@ -39,8 +43,8 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     let mut sums = vec![Vec::new(); run.options.tolerances.len() + 1];
     let steps = run.windows.len() * (run.options.tolerances.len() + 1);
     run.progress.stage("ordering", "meshes", steps as u64, 0);
-    // Percent that the strip, the shortest and several save, by tolerance and window.
-    let mut saved: [_; 3] = std::array::from_fn(|_| vec![Vec::new(); run.options.tolerances.len()]);
+    // Percent that the strip, the shortest, that of any winding and several save, by tolerance and window.
+    let mut saved: [_; 4] = std::array::from_fn(|_| vec![Vec::new(); run.options.tolerances.len()]);
     for window in run.windows {
         let Some(ground) = Ground::new(&window.field, window.weights.as_deref()) else { continue };
         let mut push = |label: [String; 2], tree: &Bitree| {
@@ -67,18 +71,20 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
         let points = points.map(|(percent, saved)| [*percent, mean_and_spread(saved)[0]]).collect();
         plot::Series { name: name.to_owned(), points }
     };
-    let series: Vec<plot::Series> = ["one strip, by the rules", "one strip, the shortest", "several strips"]
-        .into_iter()
-        .zip(&saved)
-        .map(line)
-        .collect();
+    let series: Vec<plot::Series> =
+        ["one strip, by the rules", "one strip, the shortest", "one strip, any winding", "several strips"]
+            .into_iter()
+            .zip(&saved)
+            .map(line)
+            .collect();
     let axes = ["tolerance [%]", "references saved [%]"];
     let bytes = plot::lines("Strips beside separate triangles", axes, false, &series)?;
     let caption = "References that strips save of separate triangles': means of the windows.".to_owned();
     Ok(Report {
         title: "Triangle strips".to_owned(),
         notes: vec![format!(
-            "Separate triangles take three references each. The selection is {}, the default by this criterion.",
+            "Separate triangles take three references each. Strips show the same side of all, as these do, unless any winding is \
+             allowed: then both sides have to be drawn. The selection is {}, the default by this criterion.",
             run.options.criterion.strategy()
         )],
         tables: vec![means(run, &sums), table],
@@ -89,23 +95,25 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
 /// What is told of a mesh.
 struct Row {
     cells: Vec<String>,
-    /// Percent that the strip, the shortest and several save.
-    saved: [f64; 3],
-    /// Triangles, line triangles; references: separate, of the strip, of the shortest, of several; how many these are; vertices
-    /// that a cache fetches for a triangle.
-    counts: [f64; 8],
+    /// Percent that the strip, the shortest, that of any winding and several save.
+    saved: [f64; 4],
+    /// Triangles, line triangles; references: separate, of the strip, of the shortest, of that of any winding, of several; how
+    /// many these are; vertices that a cache fetches for a triangle.
+    counts: [f64; 9],
 }
 
 fn row(tree: &Bitree) -> Row {
     let one = strip::strip(tree);
     let triangles = strip::triangles(&one);
-    let shortest = strip::shortest(tree).len();
+    let [shortest, any_winding] =
+        [Winding::Kept, Winding::Free].map(|winding| strip::shortest(tree, winding).len());
     let several = greedy_strips(&triangles);
     let references = several.iter().map(Vec::len).sum::<usize>() + several.len().saturating_sub(1);
     let separate = 3 * triangles.len();
     let lines = strip::line_triangles(&one);
     let fetched = fetches(&triangles) as f64 / triangles.len() as f64;
-    let saved = [one.len(), shortest, references].map(|n| 100.0 * (1.0 - n as f64 / separate as f64));
+    let saved =
+        [one.len(), shortest, any_winding, references].map(|n| 100.0 * (1.0 - n as f64 / separate as f64));
     let cells = vec![
         triangles.len().to_string(),
         separate.to_string(),
@@ -114,18 +122,21 @@ fn row(tree: &Bitree) -> Row {
         format!("{:.1}", saved[0]),
         shortest.to_string(),
         format!("{:.1}", saved[1]),
+        any_winding.to_string(),
+        format!("{:.1}", saved[2]),
         several.len().to_string(),
         references.to_string(),
-        format!("{:.1}", saved[2]),
+        format!("{:.1}", saved[3]),
         format!("{fetched:.3}"),
     ];
-    let counts = [triangles.len(), lines, separate, one.len(), shortest, references, several.len()];
-    let [a, b, c, d, e, f, g] = counts.map(|count| count as f64);
-    Row { cells, saved, counts: [a, b, c, d, e, f, g, fetched] }
+    let counts =
+        [triangles.len(), lines, separate, one.len(), shortest, any_winding, references, several.len()];
+    let [a, b, c, d, e, f, g, h] = counts.map(|count| count as f64);
+    Row { cells, saved, counts: [a, b, c, d, e, f, g, h, fetched] }
 }
 
 /// The windows' means by tolerance; and what strips save of all their references together, in which large meshes count for more.
-fn means(run: &Run<'_>, sums: &[Vec<[f64; 8]>]) -> Table {
+fn means(run: &Run<'_>, sums: &[Vec<[f64; 9]>]) -> Table {
     let columns = [
         "tolerance [%]",
         "windows",
@@ -138,6 +149,9 @@ fn means(run: &Run<'_>, sums: &[Vec<[f64; 8]>]) -> Table {
         "shortest strip's references",
         "saved by the shortest: mean of windows [%]",
         "saved by the shortest: of all references [%]",
+        "references of the shortest of any winding",
+        "saved by that: mean of windows [%]",
+        "saved by that: of all references [%]",
         "strips",
         "strips' references",
         "saved by the strips: mean of windows [%]",
@@ -158,8 +172,9 @@ fn means(run: &Run<'_>, sums: &[Vec<[f64; 8]>]) -> Table {
         let mut row = vec![label, list.len().to_string()];
         row.extend(counts(&[0, 1, 2, 3]).into_iter().chain(saved(3)));
         row.extend(counts(&[4]).into_iter().chain(saved(4)));
-        row.extend(counts(&[6, 5]).into_iter().chain(saved(5)));
-        row.push(format!("{:.3}", mean(7)));
+        row.extend(counts(&[5]).into_iter().chain(saved(5)));
+        row.extend(counts(&[7, 6]).into_iter().chain(saved(6)));
+        row.push(format!("{:.3}", mean(8)));
         table.push(row);
     }
     table
@@ -186,8 +201,9 @@ fn side(u: Point, v: Point) -> [Point; 2] {
     if u <= v { [u, v] } else { [v, u] }
 }
 
-/// Strips that draw each triangle once: each starts at the first triangle left, in whichever of its three
-/// ways goes on the longest, and goes from side to side while a triangle with that whole side is left.
+/// Strips that draw each triangle once, all of them turning left: each starts at the first triangle left, in whichever of
+/// its six ways goes on the longest, and goes from side to side while a triangle with that whole side is left. A way that
+/// turns right begins with its first corner twice.
 fn greedy_strips(triangles: &[[Point; 3]]) -> Vec<Vec<Point>> {
     let mut by_side: BTreeMap<[Point; 2], Vec<usize>> = BTreeMap::new();
     for (i, [a, b, c]) in triangles.iter().enumerate() {
@@ -204,7 +220,9 @@ fn greedy_strips(triangles: &[[Point; 3]]) -> Vec<Vec<Point>> {
         let [a, b, c] = triangles[start];
         let ways = [[a, b, c], [b, c, a], [c, a, b], [a, c, b], [c, b, a], [b, a, c]];
         let grown = ways.map(|way| grow(triangles, &by_side, &used, start, way));
-        let Some((strip, members)) = grown.into_iter().max_by_key(|(strip, _)| strip.len()) else { continue };
+        // Of the longest one that takes no reference more, if there is any.
+        let key = |(strip, members): &(Vec<Point>, Vec<usize>)| (members.len(), Reverse(strip.len()));
+        let Some((strip, members)) = grown.into_iter().max_by_key(key) else { continue };
         members.into_iter().for_each(|i| used[i] = true);
         strips.push(strip);
     }
@@ -218,7 +236,8 @@ fn grow(
     start: usize,
     way: [Point; 3],
 ) -> (Vec<Point>, Vec<usize>) {
-    let (mut strip, mut members) = (way.to_vec(), vec![start]);
+    let begins_twice = (!strip::is_left(way)).then_some(way[0]);
+    let (mut strip, mut members) = (begins_twice.into_iter().chain(way).collect::<Vec<_>>(), vec![start]);
     while let [.., u, v] = strip[..]
         && let Some(next) =
             by_side.get(&side(u, v)).and_then(|list| list.iter().find(|i| !used[**i] && !members.contains(i)))
@@ -249,7 +268,12 @@ mod tests {
             let one = strip::triangles(&strip::strip(&tree));
             let several = greedy_strips(&one);
             let drawn = several.iter().flat_map(|s| strip::triangles(s)).collect();
-            prop_assert!(several.iter().all(|s| strip::line_triangles(s) == 0));
+            prop_assert!(several.iter().all(|s| strip::line_triangles(s) == usize::from(s[0] == s[1])));
+            let turns_left = |s: &Vec<Point>| {
+                let mut turns = s.array_windows().enumerate();
+                turns.all(|(i, w)| w[0] == w[1] || strip::is_left(*w) == (i % 2 == 0))
+            };
+            prop_assert!(several.iter().all(turns_left));
             prop_assert_eq!(sorted(drawn), sorted(one));
         }
     }
