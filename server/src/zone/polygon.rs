@@ -7,7 +7,7 @@
 use crate::height::{HeightError, to_frame};
 use crate::projection::Projection;
 use diamantina_protocol::message::Crs;
-use diamantina_protocol::zone::CORNERS_MAX;
+use diamantina_protocol::zone::{CORNERS_MAX, Part};
 use geojson::{GeoJson, Geometry, GeometryValue, Position};
 use std::path::{Path, PathBuf};
 
@@ -68,6 +68,14 @@ pub enum PolygonError {
     Empty {
         /// The file.
         path: PathBuf,
+    },
+    /// A polygon of nothing.
+    #[error("{path}: polygon {polygon} has no ring: give it its outline, or leave it out")]
+    NoRing {
+        /// The file.
+        path: PathBuf,
+        /// From 1.
+        polygon: usize,
     },
     /// A coordinate system of its own.
     #[error(
@@ -178,12 +186,16 @@ fn parse(
     let mut number = 0;
     let mut polygons = Vec::with_capacity(found.len());
     for polygon in found {
-        let mut rings = Vec::with_capacity(polygon.len());
+        if polygon.is_empty() {
+            return Err(PolygonError::NoRing { path: path.to_owned(), polygon: polygons.len() + 1 });
+        }
+        let (mut rings, first) = (Vec::with_capacity(polygon.len()), number + 1);
         for ring in &polygon {
             number += 1;
             rings.push(reader.ring(ring, number)?);
         }
         refuse_crossings(&rings, path)?;
+        refuse_what_is_no_hole(&rings, first, path)?;
         polygons.push(rings);
     }
     Ok(polygons)
@@ -303,6 +315,29 @@ fn refuse_crossings(rings: &[Vec<[f64; 2]>], path: &Path) -> Result<(), PolygonE
     Ok(())
 }
 
+/// Refuses rings behind the first one of a polygon, which has the number `first`, that are no holes: those that do not lie
+/// in it, or lie in another hole. Of rings that do not cross one corner tells.
+fn refuse_what_is_no_hole(rings: &Rings, first: usize, path: &Path) -> Result<(), PolygonError> {
+    let alone = |ring: &Vec<[f64; 2]>| Part { ceiling: f64::INFINITY, rings: vec![ring.clone()] };
+    let parts: Vec<Part> = rings.iter().map(alone).collect();
+    for (i, ring) in rings.iter().enumerate().skip(1) {
+        let [x, y] = ring[0];
+        let within = |part: &Part| part.covers([x, y]);
+        let mut others = parts.iter().enumerate().skip(1).filter(|(j, _)| *j != i);
+        let what = if !within(&parts[0]) {
+            format!(
+                "is no hole: it lies outside of ring {first}, the outline; if it is land of its own, make it a polygon of a MultiPolygon"
+            )
+        } else if let Some((j, _)) = others.find(|(_, part)| within(part)) {
+            format!("lies in ring {}, which is a hole: make it a polygon of a MultiPolygon", first + j)
+        } else {
+            continue;
+        };
+        return Err(PolygonError::Ring { path: path.to_owned(), ring: first + i, what });
+    }
+    Ok(())
+}
+
 /// Twice the area of a triangle, positive where it turns left.
 fn turn(a: [f64; 2], b: [f64; 2], c: [f64; 2]) -> f64 {
     (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
@@ -361,7 +396,6 @@ pub fn perimeter(rings: &[Vec<[f64; 2]>]) -> f64 {
 mod tests {
     use super::*;
     use crate::projection::epsg;
-    use diamantina_protocol::zone::Part;
     use proptest::prelude::*;
 
     fn frame(text: &str) -> Result<Vec<Rings>, PolygonError> {
@@ -405,6 +439,16 @@ mod tests {
             (&square("[[0,0],[0,0],[0,0],[0,0]]"), "no area"),
             (&square("[]"), "no area"),
             (&square("[[0],[1],[2],[0]]"), "less than two numbers"),
+            (&square(""), "polygon 1 has no ring"),
+            (&format!(r#"{{"type":"MultiPolygon","coordinates":[[{SQUARE}],[]]}}"#), "polygon 2 has no ring"),
+            (
+                &square(&format!("{SQUARE},[[22,2],[22,4],[24,4],[22,2]]")),
+                "ring 2 is no hole: it lies outside",
+            ),
+            (
+                &square(&format!("{SQUARE},[[2,2],[2,8],[8,8],[8,2],[2,2]],[[4,4],[4,5],[5,5],[4,4]]")),
+                "ring 3 lies in ring 2",
+            ),
             (&square("[[0,0],[10,10],[10,0],[0,30],[0,0]]"), "edges cross"),
             (&square(&format!("{SQUARE},[[5,5],[20,5],[5,6],[5,5]]")), "edges cross"),
             (&square("[[0,0],[10,0],[10,10],[10,0],[0,10],[0,0]]"), "edges cross"),
