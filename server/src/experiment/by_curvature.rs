@@ -2,7 +2,7 @@
 //! sees of the difference.
 //!
 //! For each share of the polygons of the full grid the threshold is found by bisection, since thresholds mean
-//! nothing by themselves. The mask is the one given, or what the observer's picture shows of the full field: every
+//! nothing by themselves; and all rules are compared at the same thresholds, those of the plain rule or the ones asked for. The mask is the one given, or what the observer's picture shows of the full field: every
 //! sample that some pixel shows, and its neighbours. *All around* is the same of pictures in all directions, for an
 //! observer who turns: the change is still counted in the one picture.
 
@@ -38,12 +38,29 @@ const COLUMNS: [&str; 11] = [
     "mean difference [shades]",
 ];
 
+/// Rules that are compared.
+const RULES: usize = 5;
+
+const THRESHOLD_COLUMNS: [&str; 4 + RULES] = [
+    "DEM",
+    "x",
+    "y",
+    "threshold T",
+    "plain: polygons",
+    "view: polygons",
+    "mask: polygons",
+    "view and all around: polygons",
+    "view and mask: polygons",
+];
+
 pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     let mut table = Table::new("curvature", "Polygons by curvature and what the observer sees", &COLUMNS);
+    let mut thresholds =
+        Table::new("thresholds", "Polygons of all rules at the same thresholds", &THRESHOLD_COLUMNS);
     let mut pictures = Vec::new();
-    run.progress.stage("splitting", "meshes", (run.windows.len() * SHARES.len() * 5) as u64, 0);
+    run.progress.stage("splitting", "meshes", (run.windows.len() * SHARES.len() * RULES) as u64, 0);
     for (i, window) in run.windows.iter().enumerate() {
-        one(run, i, window, &mut table, &mut pictures)?;
+        one(run, i, window, [&mut table, &mut thresholds], &mut pictures)?;
     }
     let o = run.options;
     let notes = vec![
@@ -55,7 +72,12 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
         ),
         "Pixels count as changed beyond 8 of 255 shades.".to_owned(),
     ];
-    Ok(Report { title: "Simplification by curvature".to_owned(), notes, tables: vec![table], pictures })
+    Ok(Report {
+        title: "Simplification by curvature".to_owned(),
+        notes,
+        tables: vec![table, thresholds],
+        pictures,
+    })
 }
 
 /// One rule with its sums.
@@ -69,7 +91,7 @@ fn one(
     run: &Run<'_>,
     number: usize,
     window: &Window,
-    table: &mut Table,
+    [table, thresholds]: [&mut Table; 2],
     pictures: &mut Vec<Picture>,
 ) -> Result<(), ExperimentError> {
     let field = &window.field;
@@ -78,14 +100,14 @@ fn one(
     let mask = window.weights.clone().unwrap_or_else(|| grown(field, &full.seen));
     let around = grown(field, &seen_around(field, eye));
     let observer = Observer { at: eye.at, forgiveness: run.options.forgiveness };
-    let rules = [
+    let rules: [Rule; RULES] = [
         Rule { name: "plain", sums: Sums::new(field, None), observer: None },
         Rule { name: "view", sums: Sums::new(field, None), observer: Some(observer) },
         Rule { name: "mask", sums: Sums::new(field, Some(&mask)), observer: None },
         Rule { name: "view and all around", sums: Sums::new(field, Some(&around)), observer: Some(observer) },
         Rule { name: "view and mask", sums: Sums::new(field, Some(&mask)), observer: Some(observer) },
     ];
-    let mut series = Vec::new();
+    let (mut series, mut plain) = (Vec::new(), Vec::new());
     let about = format!("{}: all polygons, from the observer's place", window.label());
     pictures.push(png(format!("{number}-full.png"), &about, &full)?);
     for rule in &rules {
@@ -95,6 +117,9 @@ fn one(
                 return Err(ExperimentError::Stopped);
             }
             let (threshold, mesh) = with_share(field, &rule.sums, rule.observer, share / 100.0);
+            if rule.name == "plain" {
+                plain.push(threshold);
+            }
             let surface = view::surface(field, &mesh);
             let seen = view::render(field, &surface, eye);
             let [changed, mean] = view::difference(&full, &seen);
@@ -138,7 +163,37 @@ fn one(
         caption: "Pixels against polygons".to_owned(),
         bytes,
     });
+    let asked = if run.options.thresholds.is_empty() { plain } else { run.options.thresholds.clone() };
+    let series = at_thresholds(window, &rules, asked, thresholds);
+    let axes = ["threshold T", "polygons"];
+    let bytes = plot::lines(&format!("{}: the same thresholds", window.label()), axes, true, &series)?;
+    let caption = "Polygons against the threshold, by rule".to_owned();
+    pictures.push(Picture { file: format!("{number}-thresholds.svg"), caption, bytes });
     Ok(())
+}
+
+/// Counts the polygons of each rule at each threshold.
+fn at_thresholds(
+    window: &Window,
+    rules: &[Rule; RULES],
+    mut asked: Vec<f64>,
+    table: &mut Table,
+) -> Vec<plot::Series> {
+    asked.sort_by(f64::total_cmp);
+    let empty = |rule: &Rule| plot::Series { name: rule.name.to_owned(), points: Vec::new() };
+    let mut series: Vec<plot::Series> = rules.iter().map(empty).collect();
+    for threshold in asked {
+        let mut row = vec![window.source.clone(), window.at[0].to_string(), window.at[1].to_string()];
+        row.push(format!("{threshold:.4e}"));
+        for (rule, line) in rules.iter().zip(&mut series) {
+            let tree = Quadtree::new(&window.field, &rule.sums, threshold, rule.observer);
+            let polygons = templates::triangles(&tree).len();
+            row.push(polygons.to_string());
+            line.points.push([threshold, polygons as f64]);
+        }
+        table.push(row);
+    }
+    series
 }
 
 fn png(file: String, caption: &str, view: &View) -> Result<Picture, ExperimentError> {
@@ -225,4 +280,50 @@ fn grown(field: &Field, seen: &[bool]) -> Vec<f32> {
             .any(|j| (x.saturating_sub(1)..=(x + 1).min(row - 1)).any(|i| seen[j * row + i]))
     };
     (0..seen.len()).map(|slot| if near(slot) { 1.0 } else { 0.0 }).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn polygons_fall_as_thresholds_rise_and_neither_mask_nor_distance_adds_any() {
+        let height =
+            |slot: usize| ((slot % 33) as f64 * 0.7).sin() * 40.0 + ((slot / 33) as f64 * 0.9).cos() * 25.0;
+        let field = Field::new(5, (0..33 * 33).map(height).collect(), [30.0, 30.0]).unwrap();
+        let half: Vec<f32> = (0..33 * 33).map(|slot| if slot % 33 < 16 { 1.0 } else { 0.0 }).collect();
+        let observer = Some(Observer { at: [4.0, 4.0], forgiveness: 20.0 });
+        let rule =
+            |name, mask: Option<&[f32]>, observer| Rule { name, sums: Sums::new(&field, mask), observer };
+        let rules = [
+            rule("plain", None, None),
+            rule("view", None, observer),
+            rule("mask", Some(&half), None),
+            rule("view and all around", Some(&half), observer),
+            rule("view and mask", Some(&half), observer),
+        ];
+        let window = Window {
+            source: "made".to_owned(),
+            at: [0, 0],
+            origin: [0.0; 2],
+            crs: None,
+            field: field.clone(),
+            weights: None,
+        };
+        let mut table = Table::new("thresholds", "", &THRESHOLD_COLUMNS);
+        let series = at_thresholds(&window, &rules, vec![100.0, 0.01, 0.1, 1.0, 10.0], &mut table);
+        let polygons = |i: usize| series[i].points.iter().map(|p| p[1]).collect::<Vec<_>>();
+        assert_eq!(series[0].points.iter().map(|p| p[0]).collect::<Vec<_>>(), [0.01, 0.1, 1.0, 10.0, 100.0]);
+        let plain = polygons(0);
+        assert!(plain[0] > 10.0 * plain[4], "{plain:?}");
+        for i in 0..RULES {
+            let line = polygons(i);
+            assert!(line.array_windows().all(|[a, b]| a >= b), "{}: {line:?}", series[i].name);
+            assert!(
+                line.iter().zip(&plain).all(|(here, plain)| here <= plain),
+                "{}: {line:?}",
+                series[i].name
+            );
+        }
+    }
 }

@@ -64,6 +64,9 @@ pub struct Options {
     /// `curvature`: how much distance forgives: a in T (a d / D + 1)
     #[arg(long, default_value_t = 20.0, value_name = "A", allow_negative_numbers = true)]
     pub(crate) forgiveness: f64,
+    /// `curvature`: thresholds T at which the polygons of all rules are counted, in the units of its table [default: those of the plain rule's shares]
+    #[arg(long, value_delimiter = ',', value_name = "T", allow_negative_numbers = true)]
+    pub(crate) thresholds: Vec<f64>,
 }
 
 /// One run of an experiment.
@@ -139,7 +142,7 @@ pub const ALL: &[Experiment] = &[
     Experiment {
         name: "curvature",
         about: "polygons by local curvature, and the pixels that an observer sees change",
-        takes: &["mask", "observer", "eye", "forgiveness"],
+        takes: &["mask", "observer", "eye", "forgiveness", "thresholds"],
         work: Work::Windows(by_curvature::run),
     },
     Experiment {
@@ -314,6 +317,9 @@ fn check(options: &Options) -> Result<(), ExperimentError> {
     }
     if !(0.0..=1e9).contains(&options.forgiveness) {
         return wrong("--forgiveness", "a number from 0", &options.forgiveness);
+    }
+    if let Some(bad) = options.thresholds.iter().find(|t| !(**t > 0.0 && **t <= 1e9)) {
+        return wrong("--thresholds", "numbers above 0 and at most a billion", bad);
     }
     let last = options.windows.samples.saturating_sub(1);
     if let Some([x, y]) = options.observer.filter(|p| p.iter().any(|w| *w > last)) {

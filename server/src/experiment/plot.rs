@@ -3,12 +3,24 @@
 use super::ExperimentError;
 use diamantina_protocol::bintree::Point;
 use plotters::prelude::{
-    ChartBuilder, Circle, Color, IntoDrawingArea, LineSeries, Palette, Palette99, PathElement, SVGBackend,
-    Text, WHITE,
+    ChartBuilder, Circle, Color, IntoDrawingArea, LineSeries, PathElement, RGBColor, SVGBackend, Text, WHITE,
 };
 
 /// Points of a line that are dotted at most.
 const DOTTED_MAX: usize = 60;
+
+/// Colours that are told apart on white, by readers who see few colours, too: those of Okabe and Ito (2008) but for the
+/// yellow, and a grey.
+const COLOURS: [RGBColor; 8] = [
+    RGBColor(0, 114, 178),
+    RGBColor(213, 94, 0),
+    RGBColor(0, 158, 115),
+    RGBColor(204, 121, 167),
+    RGBColor(86, 180, 233),
+    RGBColor(230, 159, 0),
+    RGBColor(0, 0, 0),
+    RGBColor(140, 140, 140),
+];
 
 /// A line of a plot.
 #[derive(Debug, Clone)]
@@ -53,8 +65,13 @@ pub fn lines(
         let last = 10f64.powf(v.floor() - 2.0);
         (10f64.powf(v) / last).round() * last
     };
-    let label = |v: &f64| if is_log { format!("{:.3}", rounded(*v)) } else { format!("{v:.3}") };
-    let label = |v: &f64| label(v).trim_end_matches('0').trim_end_matches('.').to_owned();
+    let written = |v: f64| format!("{v:.3}").trim_end_matches('0').trim_end_matches('.').to_owned();
+    let label = |v: &f64, span: &std::ops::Range<f64>| match is_log {
+        false => written(*v),
+        // Where there are several, powers of ten alone are told.
+        true if span.end - span.start >= 2.0 && (v - v.round()).abs() > 1e-6 => String::new(),
+        true => written(rounded(*v)),
+    };
     let mut text = String::new();
     let failed = |e: &dyn std::fmt::Display| ExperimentError::Plot(e.to_string());
     {
@@ -63,18 +80,19 @@ pub fn lines(
         // Names stand beside the plot: within it they would cover data.
         let (area, names) = whole.split_horizontally(860);
         let (x, y) = (span(all().map(|p| p.0).collect()), span(all().map(|p| p.1).collect()));
+        let (x_label, y_label) = (|v: &f64| label(v, &x), |v: &f64| label(v, &y));
         let mut chart = ChartBuilder::on(&area)
             .caption(title, ("sans-serif", 20))
             .margin(14)
             .x_label_area_size(46)
             .y_label_area_size(70)
-            .build_cartesian_2d(x, y)
+            .build_cartesian_2d(x.clone(), y.clone())
             .map_err(|e| failed(&e))?;
         let mut mesh = chart.configure_mesh();
-        mesh.x_desc(axes[0]).y_desc(axes[1]).x_label_formatter(&label).y_label_formatter(&label);
+        mesh.x_desc(axes[0]).y_desc(axes[1]).x_label_formatter(&x_label).y_label_formatter(&y_label);
         mesh.label_style(("sans-serif", 13)).draw().map_err(|e| failed(&e))?;
         for (i, (name, points)) in series.iter().enumerate() {
-            let colour = Palette99::pick(i).to_rgba();
+            let colour = COLOURS[i % COLOURS.len()];
             // Dense lines may lie upon each other: the first are the widest, and show at the edges of the others.
             let over = u32::try_from(series.len() - 1 - i).unwrap_or(0).min(2);
             let width = if points.len() > DOTTED_MAX { 1 + 3 * over } else { 2 };

@@ -115,7 +115,7 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     let pictures = vec![savings_plot(run, &found)?];
     let notes = vec![
         format!(
-            "{} windows of {} x {} samples; criterion {:?}; tolerances in percent of each window's \
+            "{} windows of {} x {} samples; criterion {}; tolerances in percent of each window's \
              relief, or, by criteria that are no distances, of the error of the corners' two triangles.",
             run.windows.len(),
             run.options.windows.samples,

@@ -115,7 +115,7 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     notes.extend([
         format!(
             "Eyes stand {} m above the highest ground of their polygon. Bitrees without and with the mask are selected in the same \
-             way, told beside each, the default by the criterion, {:?}. Hidden ground counts for {hidden}, and for more \
+             way, told beside each, the default by the criterion, {}. Hidden ground counts for {hidden}, and for more \
              where it is hidden by less than {angle} radians over that. A pixel is {ANGLE} radians.",
             run.options.eye,
             run.options.criterion,

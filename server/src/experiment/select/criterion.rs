@@ -4,6 +4,7 @@ use super::Strategy;
 use crate::experiment::curvature::curvatures;
 use crate::experiment::field::Field;
 use crate::experiment::scan::{Plane, exceeds, rows, vertical_error};
+use clap::ValueEnum;
 use diamantina_protocol::bintree::Point;
 use diamantina_protocol::bitree::{Bitree, Facet};
 use std::ops::ControlFlow;
@@ -60,6 +61,14 @@ pub enum Criterion {
     /// How far a point is off the mean of its hypotenuse's ends, all being samples, metres: of each point
     /// alone, no bound on anything.
     Coefficient,
+}
+
+impl std::fmt::Display for Criterion {
+    /// The word of the command line.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let word = self.to_possible_value();
+        f.write_str(word.as_ref().map_or("", |word| word.get_name()))
+    }
 }
 
 impl Criterion {
