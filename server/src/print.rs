@@ -274,9 +274,10 @@ pub(super) fn zone(out: &mut impl Write, store: &Path, r: &zone::Report) -> std:
     )?;
     writeln!(
         out,
-        "  zone '{}': {} polygons, up to {:.3} m, {} eyes {:.1} m apart, {} azimuths",
+        "  zone '{}': {} polygon{}, up to {:.3} m, {} eyes {:.1} m apart, {} azimuths",
         r.zone.name,
         r.zone.parts.len(),
+        if r.zone.parts.len() == 1 { "" } else { "s" },
         r.zone.parts.iter().map(|part| part.ceiling).fold(f64::NEG_INFINITY, f64::max),
         r.eyes,
         r.spacing,

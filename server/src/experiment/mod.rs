@@ -40,7 +40,13 @@ pub struct Options {
     #[command(flatten)]
     pub(crate) windows: windows::Options,
     /// `tolerances`, `strips`, `zone`: tolerances, percent of each window's relief
-    #[arg(long, value_delimiter = ',', default_values_t = [0.0, 1.0, 2.0, 7.0, 10.0, 14.0, 50.0], value_name = "PERCENT", allow_negative_numbers = true)]
+    #[arg(
+        long,
+        value_delimiter = ',',
+        default_value = "0,1,2,7,10,14,50",
+        value_name = "PERCENT",
+        allow_negative_numbers = true
+    )]
     pub(crate) tolerances: Vec<f64>,
     /// `tolerances`: also bitrees of these numbers of points, the four corners included, the largest errors first
     #[arg(long, value_delimiter = ',', value_name = "N")]
@@ -264,6 +270,9 @@ pub fn run(
             let windows =
                 windows::read(sources, ingest, &options.windows, options.mask.as_deref(), progress)?;
             let mut report = run(&Run { windows: &windows, options, progress })?;
+            if options.windows.windows != windows::Rule::One {
+                report.notes.push(windows::counts(sources, &windows));
+            }
             let padded = windows.iter().filter(|w| w.field.samples() < w.field.heights().len()).count();
             if padded > 0 {
                 let all = windows.len();

@@ -76,6 +76,9 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     let notes = vec![
         "Heights are sent in whole units; errors are against the heights as they were, so at the end up to half a unit."
             .to_owned(),
+        "Points of 'points ...' and 'raster' are all samples of the grid that have come, of the other schemes those that are \
+         real."
+            .to_owned(),
         "Plots are of the first window, with logarithms; a step without error has no place on them.".to_owned(),
     ];
     Ok(Report { title: "Progressive transmission".to_owned(), notes, tables: vec![table], pictures })

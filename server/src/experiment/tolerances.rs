@@ -115,9 +115,10 @@ pub(super) fn run(run: &Run<'_>) -> Result<Report, ExperimentError> {
     let pictures = vec![savings_plot(run, &found)?];
     let notes = vec![
         format!(
-            "{} windows of {} x {} samples; criterion {}; tolerances in percent of each window's \
+            "{} window{} of {} x {} samples; criterion {}; tolerances in percent of each window's \
              relief, or, by criteria that are no distances, of the error of the corners' two triangles.",
             run.windows.len(),
+            if run.windows.len() == 1 { "" } else { "s" },
             run.options.windows.samples,
             run.options.windows.samples,
             run.options.criterion

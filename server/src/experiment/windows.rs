@@ -154,6 +154,15 @@ pub(super) fn read(
     Ok(windows)
 }
 
+/// How many windows each DEM has, also where it has none.
+pub(super) fn counts(sources: &[PathBuf], windows: &[Window]) -> String {
+    let mut names: Vec<String> = sources.iter().map(|path| file_name(path)).collect();
+    names.dedup();
+    let count = |name: &String| windows.iter().filter(|w| w.source == *name).count();
+    let told: Vec<String> = names.iter().map(|name| format!("{name} {}", count(name))).collect();
+    format!("Windows that fit the rule: {}.", told.join(", "))
+}
+
 /// Heights are rounded, which errors do not tell of: at most so many metres.
 const ROUNDING_MAX: f64 = 1e-3;
 
