@@ -312,18 +312,14 @@ mod tests {
         };
         let mut table = Table::new("thresholds", "", &THRESHOLD_COLUMNS);
         let series = at_thresholds(&window, &rules, vec![100.0, 0.01, 0.1, 1.0, 10.0], &mut table);
-        let polygons = |i: usize| series[i].points.iter().map(|p| p[1]).collect::<Vec<_>>();
         assert_eq!(series[0].points.iter().map(|p| p[0]).collect::<Vec<_>>(), [0.01, 0.1, 1.0, 10.0, 100.0]);
-        let plain = polygons(0);
+        let polygons = |series: &plot::Series| series.points.iter().map(|p| p[1]).collect::<Vec<_>>();
+        let plain = polygons(&series[0]);
         assert!(plain[0] > 10.0 * plain[4], "{plain:?}");
-        for i in 0..RULES {
-            let line = polygons(i);
-            assert!(line.array_windows().all(|[a, b]| a >= b), "{}: {line:?}", series[i].name);
-            assert!(
-                line.iter().zip(&plain).all(|(here, plain)| here <= plain),
-                "{}: {line:?}",
-                series[i].name
-            );
+        for one in &series {
+            let line = polygons(one);
+            assert!(line.array_windows().all(|[a, b]| a >= b), "{}: {line:?}", one.name);
+            assert!(line.iter().zip(&plain).all(|(here, plain)| here <= plain), "{}: {line:?}", one.name);
         }
     }
 }
