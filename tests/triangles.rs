@@ -126,8 +126,8 @@ fn triangles_of_real_dems_fit_at_every_moment_of_their_arrival_and_show_no_seams
         let served = serve(&[store.path().to_owned()]);
         let (mut moments, mut fitting) = (0, 0);
         for seed in 0..4u8 {
-            // Each piece of an answer comes late, so frames see the scene in parts.
-            let faults = Faults { delay: Duration::from_millis(40), ..Faults::default() };
+            // Each piece of an answer comes late, so frames see the scene in parts; also those of a busy machine.
+            let faults = Faults { delay: Duration::from_millis(160), ..Faults::default() };
             let proxy = Proxy::start(&served.address, faults, seed.into());
             let mut terrain = open(&format!("{}/scenes/world", proxy.address), Encoding::Tin, 0.7);
             let forest = terrain.scene().layers[0].forest;
