@@ -352,10 +352,12 @@ struct Receiver<'a, const LANE: usize> {
 }
 
 impl Pass for Sender {
+    #[inline]
     fn bit(&mut self, context: &mut Context, bit: bool) -> bool {
         self.coder.bit(context, bit);
         bit
     }
+    #[inline]
     fn number(&mut self, scale: &mut Scale, number: i64) -> Result<i64, Fault> {
         numbers::encode(&mut self.coder, 1, self.tables, scale, number);
         Ok(number)
@@ -367,9 +369,11 @@ impl Pass for Sender {
     fn seed(&mut self) -> Option<Seed> {
         self.mesh.seed()
     }
+    #[inline]
     fn beyond(&mut self, mark: u32) -> Beyond {
         self.mesh.beyond(mark)
     }
+    #[inline]
     fn marks(&self, mark: u32) -> [u32; 2] {
         self.mesh.marks(mark)
     }

@@ -248,9 +248,8 @@ pub(super) struct Walk {
     holes: bool,
     places: Vec<Placed>,
     gates: Vec<Gate>,
-    triangles: Vec<[u32; 3]>,
-    /// The child triangle of each triangle, and how many each has.
-    children: Vec<u8>,
+    /// The triangles, with the child triangle of each, and how many each of these has.
+    triangles: Vec<([u32; 3], u8)>,
     counts: [u32; 4],
     /// Inner borders found.
     borders: usize,
@@ -259,7 +258,8 @@ pub(super) struct Walk {
 
 #[inline(always)]
 fn difference(a: Point, b: Point) -> [i64; 2] {
-    [i64::from(b.x) - i64::from(a.x), i64::from(b.y) - i64::from(a.y)]
+    // In the square they are of 26 bits; of what lies elsewhere, and is refused for that, it does not matter.
+    [b.x.wrapping_sub(a.x), b.y.wrapping_sub(a.y)].map(i64::from)
 }
 
 /// Twice the area of the triangle `a`, `b`, `c`; above 0 if it turns left.
@@ -310,7 +310,6 @@ impl Walk {
             places: Vec::with_capacity(expected * 5 / 8),
             gates: Vec::with_capacity(expected * 7 / 4),
             triangles: Vec::with_capacity(expected),
-            children: Vec::with_capacity(expected),
             counts: [0; 4],
             borders: 0,
             contexts: Contexts::new(square.half),
@@ -325,7 +324,7 @@ impl Walk {
 
     /// The triangles, in the order in which they were met, with the child triangle of each.
     pub(super) fn triangles(&self) -> impl ExactSizeIterator<Item = ([u32; 3], u8)> + '_ {
-        self.triangles.iter().copied().zip(self.children.iter().copied())
+        self.triangles.iter().copied()
     }
 
     /// How many triangles each child triangle has.
@@ -350,8 +349,8 @@ impl Walk {
                 at += 1;
             }
             // Each part of the mesh begins in its lowest child triangle, and parts come in that order.
-            let (seed, rest) = self.children[first..].split_first().ok_or(Fault::Symbols)?;
-            if *seed < least || rest.iter().any(|child| child < seed) {
+            let ((_, seed), rest) = self.triangles[first..].split_first().ok_or(Fault::Symbols)?;
+            if *seed < least || rest.iter().any(|(_, child)| child < seed) {
                 return Err(Fault::Symbols);
             }
             least = *seed;
@@ -419,6 +418,23 @@ impl Walk {
         number
     }
 
+    /// The new sides of a gate's triangle: a gate to its apex, and one from there; given the apex, the gate that follows the
+    /// first of them, the one before the second, and the lines of the square's border on which the apex lies.
+    #[inline(always)]
+    fn sides(&mut self, here: &Here, [v, after, before]: [u32; 3], outer: u8, marks: [u32; 2]) -> [u32; 2] {
+        let state = |end: &Placed| if end.within.outer & outer == 0 { State::Open } else { State::Border };
+        let Gate { origin, prev, next, .. } = here.gate;
+        let [to, from] = [0, 1].map(|i| index(self.gates.len()) + i);
+        let behind = here.next.origin;
+        self.gates.extend_from_slice(&[
+            Gate { origin, prev, next: after, behind, mark: marks[0], state: state(&here.a) },
+            Gate { origin: v, prev: before, next, behind: origin, mark: marks[1], state: state(&here.b) },
+        ]);
+        self.gates[prev as usize].next = to;
+        self.gates[next as usize].prev = from;
+        [to, from]
+    }
+
     fn point(&self, vertex: u32) -> Point {
         self.places[vertex as usize].point
     }
@@ -481,10 +497,9 @@ impl Walk {
         if self.triangles.len() >= TRIANGLES_MAX {
             return Err(Fault::Size);
         }
-        self.triangles.push([here.gate.origin, here.next.origin, v]);
         // Closed child triangles share lines only, so there is one bit.
         let child = within.trailing_zeros() as u8;
-        self.children.push(child);
+        self.triangles.push(([here.gate.origin, here.next.origin, v], child));
         self.counts[usize::from(child % 4)] += 1;
         self.gates[here.at].state = State::Done;
         Ok(())
@@ -516,14 +531,8 @@ impl Walk {
         }
         let v = index(self.places.len() - 1);
         self.triangle(here, v, &placed)?;
-        let Gate { origin, prev, next, mark, .. } = here.gate;
-        let marks = pass.marks(mark);
-        let outer = placed.within.outer;
-        let to = self.push(origin, here.a.within.outer & outer, [prev, NONE], here.next.origin, marks[0]);
-        let from = self.push(v, here.b.within.outer & outer, [to, next], origin, marks[1]);
-        self.gates[to as usize].next = from;
-        self.gates[prev as usize].next = to;
-        self.gates[next as usize].prev = from;
+        let to = index(self.gates.len());
+        self.sides(here, [v, to + 1, to], placed.within.outer, pass.marks(here.gate.mark));
         Ok(())
     }
 
@@ -638,15 +647,9 @@ impl Walk {
             return Err(Fault::Place);
         }
         self.triangle(here, v, &apex)?;
-        let Gate { origin, prev, next, mark, .. } = here.gate;
-        let marks = pass.marks(mark);
-        let outer = apex.within.outer;
-        let to = self.push(origin, here.a.within.outer & outer, [prev, out], here.next.origin, marks[0]);
-        let from = self.push(v, here.b.within.outer & outer, [incoming, next], origin, marks[1]);
-        self.gates[prev as usize].next = to;
+        let [to, from] = self.sides(here, [v, out, incoming], apex.within.outer, pass.marks(here.gate.mark));
         self.gates[out as usize].prev = to;
         self.gates[incoming as usize].next = from;
-        self.gates[next as usize].prev = from;
         Ok(())
     }
 }
