@@ -1,25 +1,27 @@
-//! What a frame costs before anything is drawn: the cut of a thousand diamonds, all of them resident.
+//! What a frame costs before anything is drawn: the cut of a thousand diamonds, all of them resident, and the motions of
+//! those that begin to be drawn; and what it costs, beside the frames, to take in what has arrived.
 
-use criterion::{Criterion, Throughput};
+use criterion::{BatchSize, Criterion, Throughput};
 use diamantina_client::camera::{Camera, FOV_Y};
 use diamantina_client::cut::{self, Ask};
 use diamantina_client::encoding::Encoding;
+use diamantina_client::morph::{Change, Moment, Morphs, STARTS_MAX, Sight as Seen};
 use diamantina_client::sight::Sight;
 use diamantina_client::surface::{Points, Surface};
 use diamantina_protocol::bintree::Forest;
-use diamantina_protocol::diamond::Diamond;
+use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::index::Entry;
 use diamantina_protocol::message::{Kind, Layer};
-use diamantina_protocol::points::{Coding, Rule};
+use diamantina_protocol::points::{self, Coding, Rule};
 use glam::DVec3;
+use std::collections::HashMap;
 use std::hint::black_box;
 use std::sync::Arc;
 
 const SPLITS: usize = 1000;
 
-/// 65 536 cells a side, 30 m each.
-fn layer() -> Layer {
-    let forest = Forest::new(16, 6, [1, 1]).expect("within the documented limits");
+/// Cells of 30 m.
+fn layer(forest: Forest) -> Layer {
     Layer {
         name: "terrain".into(),
         kind: Kind::Terrain,
@@ -48,9 +50,78 @@ fn entry(d: Diamond) -> Option<Entry> {
     Some(Entry { error_metres, low: 0, high: 3000, bytes: 2000 })
 }
 
+type Surfaces = HashMap<Diamond, Arc<Surface>>;
+
+/// The surfaces of rough ground, down to a level, and the payload of the last.
+fn rough(layer: &Layer, last: u32) -> (Surfaces, Diamond, Vec<u8>) {
+    let (forest, mut noise) = (&layer.forest, 1u32);
+    let mut surfaces = Surfaces::new();
+    let mut newest = None;
+    for d in (0..=last).flat_map(|level| forest.diamonds(level)) {
+        let parents: Vec<_> = forest.parents(d).map(|p| (p, Arc::clone(&surfaces[&p]))).collect();
+        let (mut block, mut source) = (Block::empty(forest, d.level()), Block::empty(forest, d.level()));
+        for (p, surface) in &parents {
+            block.inherit(forest, d, *p, surface.points().expect("points").block());
+        }
+        source.fill(&forest.local(d), |_, _| {
+            noise = noise.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (noise >> 24) as i32
+        });
+        let payload = points::encode(forest, &layer.coding, d, &mut block, &source);
+        let parents: Vec<_> = parents.iter().map(|(p, surface)| (*p, surface.as_ref())).collect();
+        let surface = Surface::split(Encoding::Points, layer, d, &parents, &payload).expect("its payload");
+        surfaces.insert(d, Arc::new(surface));
+        newest = Some((d, payload));
+    }
+    let (d, payload) = newest.expect("there are diamonds");
+    (surfaces, d, payload)
+}
+
+/// What has arrived becomes a surface: heights decoded, normals worked out.
+fn arrive(criterion: &mut Criterion, layer: &Layer, surfaces: &Surfaces, d: Diamond, payload: &[u8]) {
+    let parents: Vec<_> = layer.forest.parents(d).map(|p| (p, surfaces[&p].as_ref())).collect();
+    let mut group = criterion.benchmark_group("surface");
+    group.throughput(Throughput::Elements(layer.forest.segments_at(d.level()).pow(2) as u64));
+    group.bench_function("split", |b| {
+        b.iter(|| Surface::split(Encoding::Points, layer, d, black_box(&parents), payload));
+    });
+    group.finish();
+}
+
+/// A frame in which as many motions begin as may, over parents that move.
+fn begin(criterion: &mut Criterion, layer: &Layer, surfaces: &Surfaces) {
+    let wanted: Vec<Diamond> = (0..=7).flat_map(|level| layer.forest.diamonds(level)).collect();
+    let step = |morphs: &mut Morphs, last: u32, seconds: f64| {
+        let end = wanted.partition_point(|d| d.level() <= last);
+        morphs.step(&Change {
+            layer,
+            now: Moment::at(seconds),
+            wanted: &wanted[..end],
+            surface: &|d| surfaces.get(&d).cloned(),
+            sight: &|_| Seen { visible: true, error_metres: 1.0 },
+        })
+    };
+    let ready = || {
+        let mut morphs = Morphs::new(1.0);
+        morphs.jump(&wanted[..wanted.partition_point(|d| d.level() <= 5)]);
+        // As many frames as those of the next level need to begin.
+        for frame in 0..10 {
+            step(&mut morphs, 6, 0.01 * f64::from(frame));
+        }
+        morphs
+    };
+    let mut group = criterion.benchmark_group("morph");
+    group.throughput(Throughput::Elements(STARTS_MAX as u64));
+    group.bench_function("begin", |b| {
+        b.iter_batched(ready, |mut morphs| (step(&mut morphs, 7, 0.2), morphs), BatchSize::PerIteration);
+    });
+    group.finish();
+}
+
 fn main() {
     let mut criterion = Criterion::default().configure_from_args();
-    let layer = layer();
+    // 65 536 cells a side.
+    let layer = layer(Forest::new(16, 6, [1, 1]).expect("within the documented limits"));
     let eye = DVec3::new(500_000.0 + 9e5, 4_000_000.0 + 2e5, 9000.0);
     let camera =
         Camera { eye, target: eye + DVec3::new(1e5, 4e5, -60_000.0), fov_y: FOV_Y, size: [1380, 768] };
@@ -78,5 +149,9 @@ fn main() {
         b.iter(|| cut::draw(0, black_box(&ask), &ideal, |_| Some(Arc::clone(&surface))));
     });
     group.finish();
+    let layer = self::layer(Forest::new(12, 6, [1, 1]).expect("within the documented limits"));
+    let (surfaces, newest, payload) = rough(&layer, 7);
+    arrive(&mut criterion, &layer, &surfaces, newest, &payload);
+    begin(&mut criterion, &layer, &surfaces);
     criterion.final_summary();
 }

@@ -10,7 +10,7 @@
 //! | [`fetch`] | requests by priority, retried, cancellable; answers as they stream in |
 //! | [`cache`] | decoded diamonds under a byte budget |
 //! | [`encoding`] | points or irregular triangles: which of them is streamed |
-//! | [`surface`] | a decoded diamond: points with heights and slopes, or triangles with normals |
+//! | [`surface`] | a decoded diamond: points with heights and normals, or triangles with normals |
 //! | [`morph`] | how what is drawn moves from one cut to the next |
 //! | [`controls`] | moving the eye as people know it from maps and globes |
 //! | [`pick`] | what of the drawn terrain is under the cursor |

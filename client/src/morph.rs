@@ -30,7 +30,7 @@
     reason = "local coordinates are at most 256, heights below 2^24 and motions shorter than 2^24 ticks"
 )]
 
-use crate::surface::{Points, Surface, normal};
+use crate::surface::{Points, Surface};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::{Block, Diamond, walk_shared};
@@ -50,8 +50,11 @@ pub const SECONDS_MAX: f64 = 60.0;
 /// and as much on the GPU.
 pub const MOTIONS_MAX: usize = 512;
 
-/// Motions that begin in one frame, for each layer; up to half a millisecond each. The others begin in the next one.
+/// Motions that begin in one frame, for each layer; some 0.2 ms each. The others begin in the next one.
 pub const STARTS_MAX: usize = 64;
+
+/// Motions that begin in a second, so that frames that follow one another fast are not held up for long.
+const STARTS_A_SECOND: f64 = 1000.0;
 
 /// A moment, in ticks from a beginning that all moments of a scene share. Wraps around.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -107,25 +110,26 @@ impl Record {
         t * t * (3.0 - 2.0 * t)
     }
 
-    /// How far above its own height the point is drawn, in quanta. The twin of the vertex shader's.
+    /// How far above its own height the point is drawn, in quanta, and with which normal. The twin of the vertex
+    /// shader's.
     #[must_use]
-    pub fn lift(&self, now: Moment, duration: i32) -> f32 {
+    pub fn drawn(&self, now: Moment, duration: i32) -> Place {
         if now.since(Moment(self.start)) >= duration {
-            return self.to;
+            return (self.to, self.to_normal);
         }
-        self.from + (self.to - self.from) * self.weight(now, duration)
-    }
-
-    /// The normal that it is drawn with.
-    #[must_use]
-    pub fn normal(&self, now: Moment, duration: i32) -> [i16; 2] {
         let weight = self.weight(now, duration);
-        [0, 1].map(|i| {
+        let normal = [0, 1].map(|i| {
             let [from, to] = [self.from_normal[i], self.to_normal[i]].map(f32::from);
-            (from + (to - from) * weight).round() as i16
-        })
+            let between = from + (to - from) * weight;
+            // To the nearest; `round` is a call where the architecture has no instruction for it.
+            (between + 0.5f32.copysign(between)) as i16
+        });
+        (self.from + (self.to - self.from) * weight, normal)
     }
 }
+
+/// Where a point is, or will be: quanta above its own height, and its normal.
+pub type Place = (f32, [i16; 2]);
 
 /// The motion of a split diamond's points.
 ///
@@ -225,15 +229,25 @@ impl Cut {
     }
 }
 
+/// What starts are worked out with, kept from one to the next.
+#[derive(Debug, Default)]
+struct Scratch {
+    sources: Vec<Source>,
+    before: Vec<Before>,
+}
+
 /// The motions of a layer, from frame to frame. Bounded by the cut and [`MOTIONS_MAX`].
 #[derive(Debug, Default)]
 pub struct Morphs {
     duration: i32,
     motions_max: usize,
+    /// The moment of the last frame.
+    moment: Option<Moment>,
     /// What the last frame drew as split.
     last: HashSet<Diamond, RandomState>,
     /// Those of diamonds with a point that moves.
     motions: HashMap<Diamond, Arc<Motion>, RandomState>,
+    scratch: Scratch,
 }
 
 type Set = HashSet<Diamond, RandomState>;
@@ -263,11 +277,11 @@ impl Morphs {
         self.last = wanted.iter().copied().collect();
     }
 
-    /// Goes on to the next frame: what it draws as split. Costs up to half a millisecond for each motion that begins.
+    /// Goes on to the next frame: what it draws as split. Costs some 0.2 ms for each motion that begins.
     pub fn step(&mut self, change: &Change) -> Cut {
         let forest = change.layer.forest;
         self.motions.retain(|_, motion| motion.merging || !motion.is_over(change.now));
-        let mut starts = 0;
+        let mut starts = self.starts(change.now);
         let (mut order, mut waiting) = (Vec::with_capacity(change.wanted.len()), Vec::new());
         let mut set = Set::default();
         for d in change.wanted.iter().copied() {
@@ -292,6 +306,13 @@ impl Morphs {
         let cut = Cut { shown: shown.collect(), waiting, held: held.len() };
         self.last = set;
         cut
+    }
+
+    /// How many motions may begin in this frame.
+    fn starts(&mut self, now: Moment) -> usize {
+        let ticks = self.moment.replace(now).map(|last| now.since(last));
+        let share = |ticks: i32| (f64::from(ticks) * (STARTS_A_SECOND / TICKS_A_SECOND)).ceil() as usize;
+        ticks.map_or(STARTS_MAX, |ticks| share(ticks).clamp(1, STARTS_MAX))
     }
 
     /// Begins or turns the motion of a wanted diamond whose parents are drawn as split, where there is something
@@ -363,7 +384,7 @@ impl Morphs {
 
     fn start(&mut self, change: &Change, d: Diamond, way: Way, starts: &mut usize) -> bool {
         let is_full = self.motions.len() >= self.motions_max && !self.motions.contains_key(&d);
-        if *starts >= STARTS_MAX || is_full {
+        if *starts == 0 || is_full {
             return false;
         }
         let Some(resident) = (change.surface)(d) else { return false };
@@ -385,8 +406,8 @@ impl Morphs {
             duration: self.duration,
         };
         let declared = (change.sight)(d).error_metres;
-        let motion = start.motion(way, declared, change.layer.quantum);
-        *starts += 1;
+        let motion = start.motion(way, declared, change.layer.quantum, &mut self.scratch);
+        *starts -= 1;
         if way != Way::Home && !motion.records.iter().any(Record::moves) {
             self.motions.remove(&d);
             return true;
@@ -427,52 +448,50 @@ struct Parent<'a> {
     motion: Option<&'a Motion>,
 }
 
-/// A point as the parents have it.
-#[derive(Clone, Copy)]
+/// Which slot of which parent has a point; [`NOWHERE`] for those that are new.
+type Source = u32;
+
+const NOWHERE: Source = Source::MAX;
+
+/// Two parents at most.
+const PARENT: Source = 1 << 31;
+
+/// A point as the parents have it: its height, how far above that it is drawn, and with which normal.
+#[derive(Debug, Clone, Copy)]
 struct Before {
     height: i32,
+    lift: f32,
     normal: [i16; 2],
-    record: Option<Record>,
 }
 
-/// Where a point is, or will be: quanta above its own height, and its normal.
-type Place = (f32, [i16; 2]);
-
 impl Start<'_> {
-    fn motion(&self, way: Way, declared_metres: f32, quantum: f64) -> Motion {
-        let (heights, slopes) = (self.surface.block().heights(), self.surface.slopes());
-        let before = self.before();
-        let mut records: Vec<Record> = slopes.iter().map(|slope| Record::still(normal(*slope))).collect();
-        let (n, upper) = (self.surface.block().segments(), self.forest.local(self.d).upper);
-        let (mut end, mut shift) = (self.now, 0.0f32);
-        for [p, q] in self.surface.block().places() {
-            let slot = Block::slot(n, p, q);
-            if heights[slot] == NODATA || (!upper && q > p) {
-                continue;
-            }
-            if p == 0 || q == 0 || p == 2 * n || q == 2 * n {
-                // Records that are over say nothing any more.
-                let over = |r: &Record| self.now.since(Moment(r.start)) >= self.duration;
-                let Some(record) = before[slot].record.filter(|r| !over(r)) else { continue };
-                let until = Moment(record.start.wrapping_add(self.duration));
-                if until.since(end) > 0 && record.moves() {
-                    end = until;
-                }
-                shift = shift.max((record.to - self.drawn(&record).0).abs());
-                records[slot] = record;
-                continue;
-            }
-            let own = (0.0, records[slot].to_normal);
-            let here = || self.own.map_or(own, |motion| self.drawn(&motion.records[slot]));
-            let (from, to) = match way {
-                Way::Out => (self.parents_place(&before, [p, q], true), Some(own)),
-                Way::Back => (Some(here()), Some(own)),
-                Way::Home => (Some(here()), self.parents_place(&before, [p, q], false)),
-                Way::Along => continue,
-            };
-            let (Some(from), Some(to)) = (from, to) else { continue };
+    fn motion(&self, way: Way, declared_metres: f32, quantum: f64, scratch: &mut Scratch) -> Motion {
+        let (heights, normals) = (self.surface.block().heights(), self.surface.normals());
+        let Scratch { sources, before } = scratch;
+        self.find_sources(sources);
+        before.clear();
+        if matches!(way, Way::Out | Way::Home) {
+            before.extend(self.before(sources, way == Way::Out));
+        }
+        let mut records: Vec<Record> = normals.iter().map(|normal| Record::still(*normal)).collect();
+        let (mut end, shift) = self.take_borders(sources, &mut records);
+        let mut begin = |slot: usize, from: Place, to: Place| {
             records[slot] =
                 Record { from: from.0, to: to.0, from_normal: from.1, to_normal: to.1, start: self.now.0 };
+        };
+        let own = |slot: usize| (0.0, normals[slot]);
+        let here = |slot: usize| self.own.map_or(own(slot), |motion| self.drawn(&motion.records[slot]));
+        let inside = self.inside().filter(|(slot, _)| heights[*slot] != NODATA);
+        let parents = |(slot, ends): (usize, _)| Some((slot, parents_place(before, heights[slot], ends)?));
+        match way {
+            Way::Out => {
+                inside.filter_map(parents).for_each(|(slot, from)| begin(slot, from, own(slot)));
+            }
+            Way::Home => {
+                inside.filter_map(parents).for_each(|(slot, to)| begin(slot, here(slot), to));
+            }
+            Way::Back => inside.for_each(|(slot, _)| begin(slot, here(slot), own(slot))),
+            Way::Along => {}
         }
         if way != Way::Along {
             end = Moment(self.now.0.wrapping_add(self.duration));
@@ -487,52 +506,94 @@ impl Start<'_> {
         Motion { records, duration: self.duration, end, merging, span, error_metres }
     }
 
-    /// What the parents have of each slot.
-    fn before(&self) -> Vec<Before> {
-        let nothing = Before { height: NODATA, normal: [0; 2], record: None };
-        let mut before = vec![nothing; self.surface.block().heights().len()];
-        for parent in self.parents {
-            let Some(points) = parent.surface.points() else { continue };
-            let (heights, slopes) = (points.block().heights(), points.slopes());
-            walk_shared(self.forest, self.d, parent.diamond, |to, from| {
-                let record = parent.motion.map(|motion| motion.records[from]);
-                before[to] = Before { height: heights[from], normal: normal(slopes[from]), record };
-            });
+    /// Gives the border the parents' records; until when it moves, and how far it has still to go, in quanta.
+    fn take_borders(&self, sources: &[Source], records: &mut [Record]) -> (Moment, f32) {
+        let (heights, n) = (self.surface.block().heights(), self.surface.block().segments());
+        let upper = self.forest.local(self.d).upper;
+        let (mut end, mut shift) = (self.now, 0.0f32);
+        let border = (0..=n).flat_map(|k| [[k, 0], [k, n], [0, k], [n, k]]).filter(|[i, j]| upper || j <= i);
+        for slot in border.map(|[i, j]| Block::slot(n, 2 * i, 2 * j)).filter(|slot| heights[*slot] != NODATA)
+        {
+            // Records that are over say nothing any more.
+            let over = |r: &Record| self.now.since(Moment(r.start)) >= self.duration;
+            let Some(record) = self.record(sources[slot]).filter(|r| !over(r)) else { continue };
+            let until = Moment(record.start.wrapping_add(self.duration));
+            if until.since(end) > 0 && record.moves() {
+                end = until;
+            }
+            shift = shift.max((record.to - self.drawn(&record).0).abs());
+            records[slot] = record;
         }
-        before
+        (end, shift)
+    }
+
+    /// The slots strictly inside, each with the two between which it lies on the parents' surface: the ends of the
+    /// hypotenuse that a new point halves, and the slot itself, twice, where the parents have the point.
+    fn inside(&self) -> impl Iterator<Item = (usize, [usize; 2])> + use<> {
+        let (n, upper) = (self.surface.block().segments(), self.forest.local(self.d).upper);
+        let adds_points = self.forest.adds_points(self.d.level());
+        let old = (1..n).flat_map(move |j| (if upper { 1 } else { j }..n).map(move |i| j * (n + 1) + i));
+        let rows = if self.surface.block().has_centres() { n } else { 0 };
+        let centres = (0..rows).flat_map(move |v| {
+            (if upper { 0 } else { v }..n).map(move |u| {
+                let (slot, corner) = ((n + 1).pow(2) + v * n + u, v * (n + 1) + u);
+                // The diagonals of cells alternate, as the bintree's do.
+                let ends = if (u + v).is_multiple_of(2) { [0, n + 2] } else { [1, n + 1] };
+                (slot, if adds_points { ends.map(|step| corner + step) } else { [slot; 2] })
+            })
+        });
+        old.map(|slot| (slot, [slot; 2])).chain(centres)
+    }
+
+    /// Where the parents have each slot.
+    fn find_sources(&self, sources: &mut Vec<Source>) {
+        sources.clear();
+        sources.resize(self.surface.block().heights().len(), NOWHERE);
+        for (parent, bit) in self.parents.iter().zip([0, PARENT]) {
+            walk_shared(self.forest, self.d, parent.diamond, |to, from| sources[to] = bit | from as Source);
+        }
+    }
+
+    /// The parent that has a point, and its slot there; `None` if it is new.
+    fn parent(&self, source: Source) -> Option<(&Parent<'_>, usize)> {
+        let number = usize::from(source & PARENT != 0);
+        (source != NOWHERE).then(|| (&self.parents[number], (source & !PARENT) as usize))
+    }
+
+    /// What a parent notes of the motion of a point.
+    fn record(&self, source: Source) -> Option<Record> {
+        let (parent, slot) = self.parent(source)?;
+        parent.motion.map(|motion| motion.records[slot])
+    }
+
+    /// What the parents have of each slot: as they draw it at this moment, or as it will be in the end.
+    fn before(&self, sources: &[Source], at_once: bool) -> impl Iterator<Item = Before> {
+        let nothing = Before { height: NODATA, lift: 0.0, normal: [0; 2] };
+        let find = move |source: Source| {
+            let (parent, slot) = self.parent(source)?;
+            let points = parent.surface.points()?;
+            let drawn = parent.motion.filter(|_| at_once).map(|motion| self.drawn(&motion.records[slot]));
+            let (lift, normal) = drawn.unwrap_or_else(|| (0.0, points.normals()[slot]));
+            Some(Before { height: points.block().heights()[slot], lift, normal })
+        };
+        sources.iter().map(move |source| find(*source).unwrap_or(nothing))
     }
 
     fn drawn(&self, record: &Record) -> Place {
-        (record.lift(self.now, self.duration), record.normal(self.now, self.duration))
+        record.drawn(self.now, self.duration)
     }
+}
 
-    /// Where the parents' surface is at a point strictly inside: as they draw it at this moment, or as it will be in
-    /// the end. `None` where they have nothing.
-    fn parents_place(&self, before: &[Before], [p, q]: [usize; 2], at_once: bool) -> Option<Place> {
-        let n = self.surface.block().segments();
-        let own = self.surface.block().heights()[Block::slot(n, p, q)];
-        let place = |slot: usize| -> Option<Place> {
-            let Before { height, normal, record } = before[slot];
-            if height == NODATA {
-                return None;
-            }
-            let above = (height - own) as f32;
-            match record.filter(|_| at_once).map(|record| self.drawn(&record)) {
-                Some((lift, normal)) => Some((above + lift, normal)),
-                None => Some((above, normal)),
-            }
-        };
-        if p.is_multiple_of(2) || !self.forest.adds_points(self.d.level()) {
-            return place(Block::slot(n, p, q));
-        }
-        // A new point halves a hypotenuse: the diagonals of cells alternate, as the bintree's do.
-        let (u, v) = (p / 2, q / 2);
-        let ends = if (u + v).is_multiple_of(2) { [[0, 0], [1, 1]] } else { [[1, 0], [0, 1]] };
-        let [a, b] = ends.map(|[du, dv]| place(Block::slot(n, 2 * (u + du), 2 * (v + dv))));
-        let (a, b) = (a?, b?);
-        let middle = [0, 1].map(|i| i16::midpoint(a.1[i], b.1[i]));
-        Some((f32::midpoint(a.0, b.0), middle))
+/// Where the parents' surface is at a point with a height of its own, half way between two slots; `None` where they
+/// have nothing.
+fn parents_place(before: &[Before], own: i32, ends: [usize; 2]) -> Option<Place> {
+    let [a, b] = ends.map(|slot| &before[slot]);
+    if a.height == NODATA || b.height == NODATA {
+        return None;
     }
+    let [here, there] = [a, b].map(|end| (end.height - own) as f32 + end.lift);
+    let normal = [0, 1].map(|i| i16::midpoint(a.normal[i], b.normal[i]));
+    Some((f32::midpoint(here, there), normal))
 }
 
 #[cfg(test)]
@@ -549,7 +610,7 @@ mod tests {
             let duration = 2 + (f64::from(roll()).abs() * 100.0) as i32;
             let (from, to) = (roll(), roll());
             let record = Record { from, to, from_normal: [-32767, 5], to_normal: [300, 32767], start };
-            let at = |age: i32| record.lift(Moment(start.wrapping_add(age)), duration);
+            let at = |age: i32| record.drawn(Moment(start.wrapping_add(age)), duration).0;
             assert_eq!((at(-5), at(0), at(duration), at(i32::MAX)), (from, from, to, to));
             let (mut last, steps) = (from, duration.min(50));
             for step in 1..=steps {
@@ -562,7 +623,7 @@ mod tests {
                 assert!((here - last).abs() <= 1.51 * part * (to - from).abs() + 0.01, "{record:?} {age}");
                 last = here;
             }
-            let normal = |age: i32| record.normal(Moment(start.wrapping_add(age)), duration);
+            let normal = |age: i32| record.drawn(Moment(start.wrapping_add(age)), duration).1;
             assert_eq!((normal(0), normal(duration)), (record.from_normal, record.to_normal));
         }
     }

@@ -3,7 +3,7 @@
 use crate::camera::{Camera, FOV_Y};
 use crate::drawing::DrawItem;
 use crate::encoding::Encoding;
-use crate::surface::{Surface, normal};
+use crate::surface::Surface;
 use axum::Router;
 use axum::body::{Body, Bytes};
 use axum::extract::{Path, Query, RawQuery, State};
@@ -386,21 +386,21 @@ impl Ground {
                     continue;
                 }
                 let slot = Block::slot(n, p, q);
-                let (height, slope) = (block.heights()[slot], surface.slopes()[slot]);
+                let (height, normal) = (block.heights()[slot], surface.normals()[slot]);
                 if height == NODATA {
                     continue;
                 }
                 let drawn = match &item.moving {
-                    None => (height, 0.0f32.to_bits(), normal(slope)),
+                    None => (height, 0.0f32.to_bits(), normal),
                     Some(moving) => {
                         let (record, duration) = (moving.motion.records()[slot], moving.motion.duration());
-                        let lift = record.lift(moving.now, duration);
-                        (height, lift.to_bits(), record.normal(moving.now, duration))
+                        let (lift, normal) = record.drawn(moving.now, duration);
+                        (height, lift.to_bits(), normal)
                     }
                 };
                 let at = local.lattice2([p as i64, q as i64]);
                 let mut before = *points.entry(at).or_insert(drawn);
-                // Root squares know nothing of each other's heights: along their sides, their slopes differ.
+                // Root squares know nothing of each other's heights: along their sides, their normals differ.
                 if at.iter().any(|i| i % (1i64 << forest.root_log2()) == 0) {
                     before.2 = drawn.2;
                 }

@@ -9,7 +9,7 @@ use crate::camera::Bounds;
 use crate::drawing::DrawItem;
 use crate::morph::Motion;
 use crate::surface::triangles::{self, Form, Lists};
-use crate::surface::{Points, Surface, Tin, normal};
+use crate::surface::{Points, Surface, Tin};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::message::Layer;
@@ -244,7 +244,7 @@ impl Resident {
             return 0;
         }
         self.bytes -= self.motion.take().map_or(0, |old| old.records.size());
-        let slots = item.surface.points().map(|points| points.slopes().len());
+        let slots = item.surface.points().map(|points| points.normals().len());
         let Some(motion) = wanted.filter(|m| slots == Some(m.records().len())) else {
             return 0;
         };
@@ -268,8 +268,8 @@ impl Resident {
 }
 
 /// A point as the GPU has it. One without height gets 0: no triangle uses it.
-fn point(height: i32, slope: [f32; 2]) -> SurfacePoint {
-    SurfacePoint { height: if height == NODATA { 0 } else { height }, normal: normal(slope) }
+fn point(height: i32, normal: [i16; 2]) -> SurfacePoint {
+    SurfacePoint { height: if height == NODATA { 0 } else { height }, normal }
 }
 
 /// Vertices, their own index lists, and the lowest and highest of their heights.
@@ -278,7 +278,7 @@ type Uploaded = (wgpu::Buffer, Option<Triangles>, Option<[i32; 2]>);
 fn upload_points(device: &wgpu::Device, points: &Points, wires: bool) -> Uploaded {
     let heights = points.block().heights();
     let all: Vec<SurfacePoint> =
-        heights.iter().zip(points.slopes()).map(|(h, slope)| point(*h, *slope)).collect();
+        heights.iter().zip(points.normals()).map(|(h, normal)| point(*h, *normal)).collect();
     let own = points.has_nodata().then(|| Triangles::new(device, triangles::lists_of(points.block()), wires));
     let range = range(heights.iter().copied().filter(|h| *h != NODATA));
     (vertices(device, bytemuck::cast_slice(&all)), own, range)

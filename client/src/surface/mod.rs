@@ -4,6 +4,7 @@
 //! surfaces that meet along a side agree about its normals too, and light shows no seams.
 
 mod points;
+mod shade;
 mod tin;
 pub(crate) mod triangles;
 
@@ -22,7 +23,8 @@ use diamantina_protocol::{points as points_format, tin as tin_format};
 #[allow(clippy::cast_possible_truncation, reason = "a float to integer cast saturates")]
 pub fn normal([east, north]: [f32; 2]) -> [i16; 2] {
     let length = (1.0 + east * east + north * north).sqrt();
-    [east, north].map(|s| (-s / length * 32767.0).round() as i16)
+    // To the nearest; `round` is a call where the architecture has no instruction for it.
+    [east, north].map(|s| -s / length * 32767.0).map(|s| (s + 0.5f32.copysign(s)) as i16)
 }
 
 /// Why a payload gives no surface.
