@@ -65,7 +65,7 @@ fn rough(layer: &Layer, last: u32) -> (Surfaces, Diamond, Vec<u8>) {
         }
         source.fill(&forest.local(d), |_, _| {
             noise = noise.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            (noise >> 24) as i32
+            (noise >> 24).cast_signed()
         });
         let payload = points::encode(forest, &layer.coding, d, &mut block, &source);
         let parents: Vec<_> = parents.iter().map(|(p, surface)| (*p, surface.as_ref())).collect();

@@ -12,6 +12,7 @@
 //! Pure functions: no clock, no network, no memory from frame to frame. The order of refinement is that of
 //! Duchaineau et al., *ROAMing Terrain* (1997), the forced parents likewise.
 
+mod near;
 mod show;
 
 pub use show::{Showing, show, sight};
@@ -29,6 +30,7 @@ use diamantina_protocol::sight::is_vertical;
 use diamantina_protocol::zone::Mask;
 use foldhash::fast::RandomState;
 use glam::DVec3;
+use near::Near;
 use std::cmp::Ordering;
 use std::collections::{BinaryHeap, HashMap, HashSet};
 use std::sync::Arc;
@@ -362,7 +364,8 @@ pub fn draw(
         }
     }
     drawing.wishes.sort_by(Wish::order);
-    for (i, finest) in ideal.splits.iter().zip(&ideal.finest_pixels) {
+    let finest_pixels = finest_pixels(ask, ideal, &drawn);
+    for (i, finest) in ideal.splits.iter().zip(&finest_pixels) {
         let sides = Sides::of(ask, ideal, *i, *finest, |child| ideal.node(child).split);
         drawing.error_pixels_goal = drawing.error_pixels_goal.max(sides.error_pixels);
         let Some(surface) = drawn[*i as usize].as_ref().filter(|_| whole) else { continue };
@@ -383,6 +386,28 @@ pub fn draw(
         drawing.error_pixels = f64::INFINITY;
     }
     drawing
+}
+
+/// The errors of [`Ideal::finest_pixels`], less where what is drawn is farther away than its box.
+fn finest_pixels(ask: &Ask, ideal: &Ideal, drawn: &[Option<Arc<Surface>>]) -> Vec<f64> {
+    let mut pixels = ideal.finest_pixels.clone();
+    let (mut numbers, mut errors) = (Vec::new(), Vec::new());
+    for (number, (i, pixels)) in ideal.splits.iter().zip(&pixels).enumerate() {
+        let Some(surface) = drawn[*i as usize].as_deref().filter(|_| *pixels > ask.tolerance_pixels) else {
+            continue;
+        };
+        numbers.push(number);
+        errors.push(Near {
+            diamond: ideal.node(*i).diamond,
+            surface,
+            level: ask.layer.forest.levels(),
+            error_metres: ask.layer.finest_error,
+            lift_metres: 0.0,
+            pixels: *pixels,
+        });
+    }
+    near::refine(ask, &errors, |at, less| pixels[numbers[at]] = less);
+    pixels
 }
 
 /// The triangles that a split diamond shows.

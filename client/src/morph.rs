@@ -54,7 +54,7 @@ pub const MOTIONS_MAX: usize = 512;
 pub const STARTS_MAX: usize = 64;
 
 /// Motions that begin in a second, so that frames that follow one another fast are not held up for long.
-const STARTS_A_SECOND: f64 = 1000.0;
+const STARTS_A_SECOND: i64 = 1000;
 
 /// A moment, in ticks from a beginning that all moments of a scene share. Wraps around.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -311,8 +311,8 @@ impl Morphs {
     /// How many motions may begin in this frame.
     fn starts(&mut self, now: Moment) -> usize {
         let ticks = self.moment.replace(now).map(|last| now.since(last));
-        let share = |ticks: i32| (f64::from(ticks) * (STARTS_A_SECOND / TICKS_A_SECOND)).ceil() as usize;
-        ticks.map_or(STARTS_MAX, |ticks| share(ticks).clamp(1, STARTS_MAX))
+        let share = |ticks: i32| 1 + i64::from(ticks) * STARTS_A_SECOND / TICKS_A_SECOND as i64;
+        ticks.and_then(|ticks| usize::try_from(share(ticks)).ok()).map_or(STARTS_MAX, |n| n.min(STARTS_MAX))
     }
 
     /// Begins or turns the motion of a wanted diamond whose parents are drawn as split, where there is something

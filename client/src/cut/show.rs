@@ -3,6 +3,7 @@
 //! While diamonds move, more are drawn as split than the index asks for, and some that it asks for are not yet: so
 //! the triangles and their error follow from the set of split diamonds, whatever chose it.
 
+use super::near::{self, Near};
 use super::{Ask, Ideal, unknown};
 use crate::camera::Plane;
 use crate::drawing::{DrawItem, Moving};
@@ -54,13 +55,19 @@ pub fn show(
     let forest = &ask.layer.forest;
     let seen = |d: Diamond| seen(ask, ideal, d, entry(d));
     let split: HashSet<Diamond, RandomState> = cut.shown.iter().map(|shown| shown.diamond).collect();
-    let mut showing = Showing::default();
+    let (mut showing, mut errors) = (Showing::default(), Vec::new());
     for shown in &cut.shown {
         let d = shown.diamond;
         if let Some(motion) = shown.motion.as_ref().filter(|_| seen(d).in_view) {
             let entry = entry(d).unwrap_or_else(|| unknown(ask.layer));
-            let pixels = ask.pixels(d, d.level(), motion.error_metres(), &ask.bounds(d, &entry));
-            showing.error_pixels = showing.error_pixels.max(pixels);
+            errors.push(Near {
+                diamond: d,
+                surface: &shown.surface,
+                level: d.level(),
+                error_metres: motion.error_metres(),
+                lift_metres: f64::from(motion.span()) * ask.layer.quantum,
+                pixels: ask.pixels(d, d.level(), motion.error_metres(), &ask.bounds(d, &entry)),
+            });
         }
         let mut sides = 0;
         if d.level() + 1 == forest.levels() {
@@ -78,6 +85,9 @@ pub fn show(
             showing.items.push(DrawItem { layer: number, diamond: d, surface, sides, moving });
         }
     }
+    let mut pixels: Vec<f64> = errors.iter().map(|error| error.pixels).collect();
+    near::refine(ask, &errors, |at, less| pixels[at] = less);
+    showing.error_pixels = pixels.into_iter().fold(0.0, f64::max);
     for d in &cut.waiting {
         showing.error_pixels = showing.error_pixels.max(seen(*d).pixels);
     }

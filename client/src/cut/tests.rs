@@ -305,3 +305,54 @@ fn a_cut_of_a_thousand_diamonds_takes_less_than_a_frame() {
     println!("1000 splits, {items} items: {:.3} ms", best * 1e3);
     assert!(best < 0.010, "{best} s");
 }
+
+/// Low over the ground, within the boxes of what is below: no point that is drawn looks farther off than the cut says,
+/// which says far less than those boxes would.
+#[test]
+fn what_is_far_below_the_eye_counts_as_that() {
+    let built = &world()[0];
+    let (layer, forest) = (&built.layer, &built.layer.forest);
+    let all = surfaces(built, |_| true);
+    let error = f64::from(layer.finest_error);
+    let mut dice = Dice(11);
+    let finest: Vec<Diamond> = forest.diamonds(forest.levels() - 1).collect();
+    let (mut hovers, mut nearer) = (0, 0);
+    for _ in 0..60 {
+        // Some metres above a point of the finest diamonds.
+        let d = finest[(dice.roll() * finest.len() as f64) as usize];
+        let block = all[&d].points().unwrap().block();
+        let n = block.segments();
+        let height = layer.metres(block.heights()[Block::slot(n, n, n)]);
+        let place = [0, 1].map(|i| layer.origin[i] + layer.cell[i] * f64::from(d.centre()[i]));
+        let eye = DVec3::new(place[0], place[1], height + 2.0 + 30.0 * dice.roll());
+        let target = eye + DVec3::new(dice.roll() - 0.5, dice.roll() - 0.5, -dice.roll());
+        let camera = Camera { eye, target, ..above() };
+        let ask = ask(built, &camera, 1.0);
+        let ideal = choose(&ask, |d| built.entries.get(&d).copied());
+        let drawing = draw(0, &ask, &ideal, |d| all.get(&d).cloned());
+        assert_eq!(drawing.error_pixels, drawing.error_pixels_goal);
+        let boxes = ideal.finest_pixels.iter().copied().fold(0.0, f64::max);
+        hovers += usize::from(boxes > 20.0);
+        nearer += usize::from(boxes > 20.0 && boxes > 2.0 * drawing.error_pixels);
+        let planes = camera.planes();
+        for item in drawing.items.iter().filter(|item| item.diamond.level() + 1 == forest.levels()) {
+            let (local, block) = (forest.local(item.diamond), item.surface.points().unwrap().block());
+            for [p, q] in block.places() {
+                let height = block.heights()[Block::slot(block.segments(), p, q)];
+                let at = local.lattice2([p as i64, q as i64]);
+                let place = [0, 1].map(|i| layer.origin[i] + layer.cell[i] * at[i] as f64);
+                let drawn = DVec3::new(place[0], place[1], layer.metres(height));
+                let in_view = planes.iter().all(|plane| plane.normal.dot(drawn) + plane.offset >= 0.0);
+                if height == NODATA || !in_view || (drawn - eye).length() < nearest_drawn(layer.cell) {
+                    continue;
+                }
+                for truth in [drawn - DVec3::Z * error, drawn + DVec3::Z * error] {
+                    let pixels = (truth - eye).angle_between(drawn - eye) * camera.pixels_per_radian();
+                    let said = drawing.error_pixels.max(ask.tolerance_pixels);
+                    assert!(pixels <= said * 1.001, "{pixels} at {drawn}, {said} said, eye {eye}");
+                }
+            }
+        }
+    }
+    assert!(hovers > 10 && nearer > hovers / 2, "{nearer} of {hovers}");
+}
