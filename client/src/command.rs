@@ -462,9 +462,9 @@ fn view(args: &ViewerArgs) -> Result<(), Failure> {
     }
     let (url, at) = match args.view.url.split_once('#') {
         Some((url, view)) => {
-            let expected = "expected #x,y,z,heading,pitch, metres and degrees, or with ,seconds behind, as `Copy view` gives it";
-            let camera = viewer::camera_at(view, args.view.size);
-            (url.to_owned(), Some(camera.ok_or_else(|| Failure(2, format!("#{view}: {expected}")))?))
+            let expected = "expected #x,y,z,heading,pitch, metres and degrees, or with ,seconds or &exaggeration=FACTOR (0.1 to 20) behind, as `Copy view` gives it";
+            let at = viewer::View::parse(view, args.view.size);
+            (url.to_owned(), Some(at.ok_or_else(|| Failure(2, format!("#{view}: {expected}")))?))
         }
         None => (args.view.url.clone(), None),
     };
@@ -473,10 +473,7 @@ fn view(args: &ViewerArgs) -> Result<(), Failure> {
     let terrain = view.open(morph, kept.0.as_ref(), true)?;
     let look = view.look(&terrain);
     let title = format!("{} - Diamantina", terrain.scene().name);
-    let mut viewer = Viewer::new(terrain, &url, look, view.size, at);
-    if let Some((_, view)) = args.view.url.split_once('#') {
-        viewer.set_time_of(view);
-    }
+    let viewer = Viewer::new(terrain, &url, look, view.size, at);
     viewer::window::run(viewer, &title, &view.render_options()).map_err(|e| Failure(1, e.to_string()))
 }
 

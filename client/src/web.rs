@@ -158,12 +158,12 @@ async fn open(page: &Page) -> Result<(), String> {
         terrain => terrain.map_err(|e| e.to_string())?,
     };
     let size = page.size();
-    let camera = viewer::camera_at(&address.view, size);
+    let view = viewer::View::parse(&address.view, size);
     let scene = terrain.scene();
     page.title(&format!("{} - Diamantina", scene.name));
     let look = Look::of(scene);
     let link = address.link(&scene.name);
-    let mut viewer = Viewer::new(terrain, &link, look, size, camera);
+    let mut viewer = Viewer::new(terrain, &link, look, size, view);
     viewer.recall(viewer::read_bookmarks(&page.recall(&shelf(viewer.url())).unwrap_or_default()));
     let events = EventLoop::new().map_err(|e| e.to_string())?;
     let shown = Shown {

@@ -1,6 +1,6 @@
 //! Views that somebody wants to come back to.
 
-use super::{Ask, Viewer, camera_at};
+use super::{Ask, View, Viewer};
 use egui::{RichText, TextEdit, Ui};
 use serde::{Deserialize, Serialize};
 
@@ -28,7 +28,7 @@ const NAME_MAX: usize = 60;
 #[must_use]
 pub fn read(text: &str) -> Vec<Bookmark> {
     let all: Vec<Bookmark> = serde_json::from_str(text).unwrap_or_default();
-    all.into_iter().filter(|one| camera_at(&one.view, [1, 1]).is_some()).collect()
+    all.into_iter().filter(|one| View::parse(&one.view, [1, 1]).is_some()).collect()
 }
 
 /// The list in the panel.

@@ -15,6 +15,7 @@
 //! All input comes through egui, so the same code serves a window and whatever else egui runs in, and a test can press
 //! keys and drag without any window.
 
+mod address;
 mod bookmarks;
 mod boxes;
 pub(crate) mod display;
@@ -27,9 +28,9 @@ mod truth;
 #[cfg(not(target_arch = "wasm32"))]
 pub mod window;
 
+pub use address::View;
 pub use bookmarks::{Bookmark, read as read_bookmarks};
 pub use measure::Mark;
-pub use time::time_at;
 
 use crate::annotate::{self, Subject};
 use crate::camera::Camera;
@@ -137,17 +138,24 @@ pub struct Viewer {
 }
 
 impl Viewer {
-    /// A viewer of the scene at `url` that begins at `camera` (heights as they are), or with an overview.
+    /// A viewer of the scene at `url` that begins with a view, or with an overview.
     #[must_use]
-    pub fn new(mut terrain: Terrain, url: &str, look: Look, size: [u32; 2], camera: Option<Camera>) -> Self {
+    pub fn new(mut terrain: Terrain, url: &str, look: Look, size: [u32; 2], view: Option<View>) -> Self {
+        let mut look = look;
+        if let Some(exaggeration) =
+            view.and_then(|view| view.exaggeration).filter(|_| look != look.truthful())
+        {
+            look.exaggeration = exaggeration;
+        }
         terrain.set_exaggeration(look.exaggeration);
         let home = overview::stretched_overview(&terrain.shown_scene(), size, look.exaggeration);
         let stretched = |c: Camera| Camera { size, ..overview::stretched(&c, look.exaggeration) };
         let globe = Globe::of(&terrain.scene().frame);
         let time = terrain.time();
-        Self {
-            controls: Controls::new(stretched(camera.unwrap_or(home))),
-            begins: camera.is_none(),
+        let camera = view.map_or(home, |view| stretched(view.camera));
+        let mut viewer = Self {
+            controls: Controls::new(camera),
+            begins: view.is_none(),
             terrain,
             url: url.to_owned(),
             picker: Picker::default(),
@@ -169,7 +177,9 @@ impl Viewer {
             goes_on: false,
             message: None,
             asks: Vec::new(),
-        }
+        };
+        viewer.set_time(view.and_then(|view| view.seconds));
+        viewer
     }
 
     /// The camera now; its heights are stretched as the look says.
@@ -250,31 +260,6 @@ impl Viewer {
     /// The picture's size in pixels.
     pub fn resize(&mut self, size: [u32; 2]) {
         self.controls.resize(size);
-    }
-
-    /// The scene's address with the view: `URL#x,y,z,heading,pitch`, metres and degrees; with a comma and seconds behind
-    /// where water changes with time.
-    #[must_use]
-    pub fn address(&self) -> String {
-        format!("{}#{}", self.url, self.view())
-    }
-
-    /// What follows the `#` of its address.
-    #[must_use]
-    pub fn view(&self) -> String {
-        let eye = self.camera().eye;
-        // As they are where heights are not multiplied.
-        let z = eye.z / self.look.exaggeration;
-        let (down, ahead) = self.controls.pitch().sin_cos();
-        let pitch = (down / self.look.exaggeration).atan2(ahead).to_degrees();
-        let heading = self.controls.heading().to_degrees();
-        let heading = heading.rem_euclid(360.0);
-        let time = if self.terrain.scene().series.is_empty() {
-            String::new()
-        } else {
-            format!(",{:.3}", self.player.seconds)
-        };
-        format!("{:.2},{:.2},{z:.2},{heading:.3},{pitch:.3}{time}", eye.x, eye.y)
     }
 
     /// Flies to where another camera is, whose heights are as they are.
@@ -631,20 +616,6 @@ fn is_pressed(ui: &Ui, key: Key) -> bool {
             if *found == key && matches!(*modifiers, Modifiers::NONE | Modifiers::SHIFT))
     };
     ui.input(|input| input.events.iter().any(is_it))
-}
-
-/// The camera of what follows the `#` of an address: see [`Viewer::address`]. `None` if it is none. See also [`time_at`].
-#[must_use]
-pub fn camera_at(view: &str, size: [u32; 2]) -> Option<Camera> {
-    let numbers: Vec<f64> = view.trim().split(',').map(|n| n.trim().parse().ok()).collect::<Option<_>>()?;
-    let (&[x, y, z, heading, pitch] | &[x, y, z, heading, pitch, _]) = numbers.as_slice() else {
-        return None;
-    };
-    let is_view = numbers.iter().all(|n: &f64| n.is_finite()) && (-90.0..=90.0).contains(&pitch);
-    let (heading, pitch) = (heading.to_radians(), pitch.to_radians());
-    let ahead = DVec3::new(heading.sin() * pitch.cos(), heading.cos() * pitch.cos(), -pitch.sin());
-    let eye = DVec3::new(x, y, z);
-    is_view.then(|| Camera { eye, target: eye + ahead * z.abs().max(1.0), fov_y: crate::camera::FOV_Y, size })
 }
 
 #[cfg(test)]

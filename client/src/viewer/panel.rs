@@ -1,5 +1,6 @@
 //! The panel: what can be chosen, figures, and what was clicked.
 
+use super::address::EXAGGERATIONS;
 use super::{Ask, Viewer, bookmarks, measure, time};
 use crate::encoding::Encoding;
 use crate::render::{Background, Colours, Shading};
@@ -132,7 +133,7 @@ fn view(viewer: &mut Viewer, ui: &mut Ui) {
         viewer.set_true(is_true);
     }
     let mut exaggeration = viewer.look.exaggeration;
-    let slider = Slider::new(&mut exaggeration, 0.1..=20.0).logarithmic(true).text("exaggeration");
+    let slider = Slider::new(&mut exaggeration, EXAGGERATIONS).logarithmic(true).text("exaggeration");
     if ui.add_enabled(!is_true, slider).changed() {
         viewer.set_exaggeration(exaggeration);
     }
@@ -352,24 +353,33 @@ fn grouped(number: u64) -> String {
 }
 
 /// Values over time, the newest at the right.
+/// The top of a plot's scale: what nine of ten values are below, and a quarter more. A few that are far larger, as errors
+/// are until the first data are there, would press all others flat; they leave the plot at its top.
+pub(super) fn top(values: &VecDeque<f32>) -> f32 {
+    let mut known: Vec<f32> = values.iter().copied().filter(|v| v.is_finite()).collect();
+    known.sort_unstable_by(f32::total_cmp);
+    let most = known.last().copied().unwrap_or(0.0);
+    let usual = known.get(known.len() * 9 / 10).copied().unwrap_or(0.0);
+    if usual > 0.0 { most.min(1.25 * usual) } else { most }
+}
+
 fn plot(ui: &mut Ui, name: &str, values: &VecDeque<f32>) {
     let size = egui::vec2(ui.available_width(), 34.0);
     let (rect, _) = ui.allocate_exact_size(size, egui::Sense::hover());
     let painter = ui.painter_at(rect);
     painter.rect_filled(rect, 3.0, ui.visuals().extreme_bg_color);
-    let known = || values.iter().copied().filter(|v| v.is_finite());
-    let most = known().fold(0.0f32, f32::max);
+    let top = top(values);
     let points: Vec<egui::Pos2> = values
         .iter()
         .enumerate()
         .filter(|(_, v)| v.is_finite())
         .map(|(i, v)| {
             let x = rect.right() - (values.len() - 1 - i) as f32 / HISTORY as f32 * rect.width();
-            egui::pos2(x, rect.bottom() - 2.0 - v / most.max(1e-6) * (rect.height() - 6.0))
+            egui::pos2(x, rect.bottom() - 2.0 - (v / top.max(1e-6)).min(1.0) * (rect.height() - 6.0))
         })
         .collect();
     painter.line(points, Stroke::new(1.2, ui.visuals().hyperlink_color));
-    let text = format!("{name}, up to {most:.1}");
+    let text = format!("{name}, up to {top:.1}");
     let font = egui::FontId::proportional(10.0);
     painter.text(
         rect.left_top() + egui::vec2(4.0, 2.0),

@@ -17,6 +17,10 @@ struct Hand {
     served: Served,
 }
 
+fn view_at(camera: Camera) -> View {
+    View { camera, seconds: None, exaggeration: None }
+}
+
 impl Hand {
     fn new(camera: Option<Camera>) -> Self {
         Self::of(1, camera)
@@ -31,7 +35,7 @@ impl Hand {
         let served = Served::start(layers, Faults::default());
         let terrain =
             Terrain::open(&served.url, Options { fetch: fetch::Options::default(), ..Options::default() });
-        let viewer = Viewer::new(terrain.unwrap(), &served.url, look, SIZE, camera);
+        let viewer = Viewer::new(terrain.unwrap(), &served.url, look, SIZE, camera.map(view_at));
         let mut hand = Self { viewer, context: egui::Context::default(), seconds: 0.0, served };
         hand.settle();
         hand
@@ -263,15 +267,36 @@ fn an_address_opens_the_same_view_again() {
     let address = hand.viewer.address();
     let (url, view) = address.split_once('#').unwrap();
     assert_eq!(url, hand.viewer.url);
-    let camera = camera_at(view, SIZE).unwrap();
-    let again = Hand::with(1, *hand.viewer.look(), Some(camera));
+    let read = View::parse(view, SIZE).unwrap();
+    assert_eq!((read.exaggeration, read.seconds), (Some(2.5), None));
+    let mut again = Hand::new(None);
+    assert!(again.viewer.go_to(view));
+    again.settle();
     let [a, b] = [&hand, &again].map(Hand::camera);
     assert!((a.eye - b.eye).length() < 0.1, "{} {}", a.eye, b.eye);
     let [ahead, also] = [a, b].map(|camera| (camera.target - camera.eye).normalize());
     assert!((ahead - also).length() < 1e-4, "{ahead} {also}");
-    assert_eq!(view, again.viewer.view());
-    for wrong in ["", "1,2,3", "1,2,3,4,x", "1,2,nan,0,0", "1,2,3,0,95", "1,2,3,4,5,x", "1,2,3,4,5,6,7"] {
-        assert!(camera_at(wrong, SIZE).is_none(), "{wrong}");
+    assert_eq!(again.viewer.look().exaggeration, 2.5);
+    // Opened with it, it is there at once; and nothing is multiplied where only what was measured is shown.
+    let opened = |look: Look| {
+        let terrain = Terrain::open(&hand.served.url, Options::default()).unwrap();
+        Viewer::new(terrain, url, look, SIZE, Some(read))
+    };
+    assert_eq!(opened(Look::default()).view(), view);
+    assert_eq!(opened(Look::default().truthful()).look().exaggeration, 1.0);
+    for wrong in [
+        "",
+        "1,2,3",
+        "1,2,3,4,x",
+        "1,2,nan,0,0",
+        "1,2,3,0,95",
+        "1,2,3,4,5,x",
+        "1,2,3,4,5,6,7",
+        "1,2,3,4,5&exaggeration=0",
+        "1,2,3,4,5&exaggeration=x",
+        "1,2,3,4,5&other=1",
+    ] {
+        assert!(View::parse(wrong, SIZE).is_none(), "{wrong}");
     }
 }
 
@@ -334,8 +359,8 @@ fn views_are_kept_and_found_again() {
     again.viewer.recall(read_bookmarks(&texts[1]));
     let names: Vec<&str> = again.viewer.bookmarks().iter().map(|one| one.name.as_str()).collect();
     assert_eq!(names, ["view 1", "view 2"]);
-    let first = camera_at(&again.viewer.bookmarks()[0].view, SIZE).unwrap();
-    again.viewer.fly_to(&first);
+    let first = again.viewer.bookmarks()[0].view.clone();
+    assert!(again.viewer.go_to(&first));
     again.settle();
     assert!((again.camera().eye - home.eye).length() < 0.1, "{:?}", again.camera());
 }
@@ -541,7 +566,7 @@ fn a_new_version_is_noticed_while_nothing_is_missing() {
     let served = Served::start(1, Faults::default());
     let fetch = fetch::Options { follow: Some(Duration::from_millis(20)), ..fetch::Options::default() };
     let terrain = Terrain::open(&served.url, Options { fetch, ..Options::default() }).unwrap();
-    let viewer = Viewer::new(terrain, &served.url, Look::default(), SIZE, Some(looking_down()));
+    let viewer = Viewer::new(terrain, &served.url, Look::default(), SIZE, Some(view_at(looking_down())));
     let mut hand = Hand { viewer, context: egui::Context::default(), seconds: 0.0, served };
     hand.settle();
     for _ in 0..50 {
@@ -654,11 +679,8 @@ fn water_plays_in_time_from_the_panel_and_its_address_tells_when() {
     hand.settle();
     assert!(is_drawn(&hand, 1) && hand.viewer.player().seconds == 10.5);
     assert!(!hand.viewer.go_to("1,2,3"));
-    assert_eq!(
-        (time_at("1,2,3,4,5"), time_at("1,2,3,4,5,-6"), time_at("1,2,3,4,5, 6")),
-        (None, None, Some(6.0))
-    );
-    assert!(camera_at("1,2,3,4,5,6", SIZE).is_some() && camera_at("1,2,3,4,5,6,7", SIZE).is_none());
+    let time = |view: &str| View::parse(view, SIZE).unwrap().seconds;
+    assert_eq!((time("1,2,3,4,5"), time("1,2,3,4,5,-6"), time("1,2,3,4,5, 6")), (None, None, Some(6.0)));
 }
 
 #[test]
@@ -735,4 +757,15 @@ fn the_panel_writes_over_the_picture() {
     let alone = texts(&mut hand, false);
     assert!(find(&alone, "Height [m]").unwrap().x > legend.x && find(&alone, "View").is_none());
     assert!(alone.iter().any(|(text, _)| text.starts_with("at the cross (") && !text.contains("no ground")));
+}
+
+#[test]
+fn a_few_huge_values_leave_a_plot_readable() {
+    let mut values: std::collections::VecDeque<f32> =
+        (0..200).map(|i| 1.0 + (i % 10) as f32 / 10.0).collect();
+    assert_eq!(panel::top(&values), 1.9);
+    values.extend([f32::INFINITY, 9000.0, 8000.0, 7000.0]);
+    assert!(panel::top(&values) < 3.0, "{}", panel::top(&values));
+    assert_eq!(panel::top(&[0.0, 0.0, 5.0].into()), 5.0);
+    assert_eq!(panel::top(&std::collections::VecDeque::new()), 0.0);
 }

@@ -1,7 +1,7 @@
 //! Water that changes with time, in the viewer: a slider, and a clock that plays.
 
+use super::Viewer;
 use super::panel::heading;
-use super::{Viewer, camera_at};
 use crate::player::{self, SPEED};
 use egui::{Button, RichText, Slider, Ui};
 
@@ -75,26 +75,4 @@ impl Viewer {
         player.go_on(seconds, &terrain.scene().series, |at| terrain.is_ready_at(at));
         terrain.set_time(player.seconds, player.course());
     }
-
-    /// Goes to what follows the `#` of an address: flies there, and sets the time. Whether it is a view.
-    pub fn go_to(&mut self, view: &str) -> bool {
-        let Some(camera) = camera_at(view, self.camera().size) else { return false };
-        self.fly_to(&camera);
-        self.set_time_of(view);
-        true
-    }
-
-    /// Sets the time to that of what follows the `#` of an address, if it tells of one.
-    pub fn set_time_of(&mut self, view: &str) {
-        if let Some(seconds) = time_at(view) {
-            self.player.set(seconds, &self.terrain.scene().series);
-        }
-    }
-}
-
-/// The time of what follows the `#` of an address, in seconds; `None` if it tells of none.
-#[must_use]
-pub fn time_at(view: &str) -> Option<f64> {
-    let time = view.trim().split(',').nth(5)?.trim().parse().ok()?;
-    Some(time).filter(|seconds: &f64| seconds.is_finite() && *seconds >= 0.0)
 }
