@@ -17,6 +17,12 @@ struct Water {
     waves: array<vec4<f32>, 10>,
 }
 
+// The variance of slopes, along an axis, of ripples smaller than the waves: near, and where waves are smaller than a pixel.
+const RIPPLES: vec2<f32> = vec2<f32>(4e-4, 3e-3);
+
+// What the sun sends onto the water, of what makes the sky's white: less than it does, since here what is too bright is lost.
+const SUNLIGHT: f32 = 0.18;
+
 @group(2) @binding(0) var<uniform> water: Water;
 @group(2) @binding(1) var smooth_sampler: sampler;
 @group(2) @binding(2) var mirrored: texture_2d<f32>;
@@ -34,16 +40,34 @@ fn projected(p: vec3<f32>) -> vec3<f32> {
     return vec3<f32>(place, select(0.0, 1.0, clip.w > 0.0));
 }
 
-// The slope of the waves at a place, those too small for a pixel of so many metres left out.
-fn wave_slope(across: vec2<f32>, pixel: f32) -> vec2<f32> {
-    var slope = vec2<f32>(0.0);
+// The slope of the waves at a place; those too small for a pixel, which goes from the place to `right` and `down` of it,
+// are left out: z is the variance of their slopes along an axis, ripples included.
+fn wave_slope(across: vec2<f32>, right: vec2<f32>, down: vec2<f32>) -> vec3<f32> {
+    var slope = vec3<f32>(0.0);
+    var shortest = 0.0;
     for (var i = 0; i < 10; i++) {
         let wave = water.waves[i];
-        let turn = length(wave.xy);
-        let seen = 1.0 - smoothstep(0.6, 2.0, pixel * turn);
-        slope += wave.xy / turn * (wave.w * seen * cos(dot(wave.xy, across) + wave.z));
+        // Radians of the wave that a pixel covers: beyond pi its samples show another wave.
+        let step = max(abs(dot(wave.xy, right)), abs(dot(wave.xy, down)));
+        let seen = 1.0 - smoothstep(0.3, 1.2, step);
+        let along = wave.xy / length(wave.xy) * (wave.w * seen * cos(dot(wave.xy, across) + wave.z));
+        slope += vec3<f32>(along, 0.25 * wave.w * wave.w * (1.0 - seen * seen));
+        shortest = max(shortest, 1.0 - seen);
     }
-    return slope;
+    return slope + vec3<f32>(0.0, 0.0, mix(RIPPLES.x, RIPPLES.y, shortest));
+}
+
+// How bright facets of the surface send the sun to the eye, whose slopes vary about that of `normal` by `variance` along
+// each axis: after Cox and Munk, Measurement of the Roughness of the Sea Surface from Photographs of the Sun's Glitter (1954).
+fn glitter_of(ray: vec3<f32>, normal: vec3<f32>, variance: f32) -> f32 {
+    let facet = normalize(frame.sun.xyz - ray);
+    if facet.z <= 0.0 || frame.sun.z <= 0.0 {
+        return 0.0;
+    }
+    let off = facet.xy / facet.z - normal.xy / max(normal.z, 0.1);
+    let share = exp(-0.5 * dot(off, off) / variance) / (6.2832 * variance);
+    let steep = facet.z * facet.z;
+    return share / (4.0 * steep * steep * max(-dot(ray, normal), 0.1));
 }
 
 // Metres from the eye to what the scene without water shows at a place of the screen, along a ray that goes `forward`
@@ -67,16 +91,15 @@ fn outside(place: vec2<f32>) -> f32 {
 @fragment
 fn water_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
     let p = shaded.from_eye;
-    let pixel = max(length(fwidth(p.xy)), 1e-6);
     let distance = length(p);
     let ray = p / distance;
     let here = shaded.clip.xy / vec2<f32>(textureDimensions(scene));
     let ahead = dot(ray, frame.forward.xyz);
 
     let still = normal_of(shaded);
-    let slope = wave_slope(p.xy, pixel);
+    let slope = wave_slope(p.xy, dpdx(p.xy), dpdy(p.xy));
     // Waves never turn a surface away from the eye.
-    var normal = normalize(vec3<f32>(still.xy - slope * still.z, still.z));
+    var normal = normalize(vec3<f32>(still.xy - slope.xy * still.z, still.z));
     let from_below = dot(ray, still) > 0.0;
     if from_below {
         normal = -normal;
@@ -132,8 +155,7 @@ fn water_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
     let is_open = 1.0 - mix(found.a, 0.0, lost);
     let disc = sun_towards(back, angle) * (is_open * (1.0 - water.optics.w));
     let above = mix(found.rgb, sky_towards(back), lost) + disc;
-    let sun = max(dot(back, frame.sun.xyz), 0.0);
-    let glitter = water.optics.w * (pow(sun, 900.0) * 12.0 + pow(sun, 60.0) * 0.25);
+    let glitter = water.optics.w * SUNLIGHT * glitter_of(ray, normal, slope.z);
     let colour = mix(hazed(through, p), above + glitter * vec3<f32>(1.08, 1.04, 0.97), fresnel);
     return encoded(colour);
 }
