@@ -1,5 +1,6 @@
 //! What a zone costs over 4097 x 4097 samples of the made landscape: one eye looking all around, and whole masks of
-//! 200 eyes, each cast once: around a bay, and around a disc with a summit, whose height eyes stand at and see far from.
+//! 200 eyes, each cast once: around a bay, and around a disc with a summit, whose height eyes stand at and see far from;
+//! and around a disc of rough ground, of which half is seen.
 #![allow(clippy::cast_possible_truncation, reason = "heights below 4000 m in decimetres")]
 
 use criterion::{Criterion, Throughput};
@@ -16,21 +17,44 @@ use std::time::Instant;
 
 const SIDE: usize = 4097;
 
-/// The made landscape in decimetres, its sea without heights.
-fn heights() -> Tiled<i32> {
-    let part = |w: usize| w as f64 / (SIDE - 1) as f64;
-    // Made here first: making it needs the workers.
-    let _ = sample::height(0.5, 0.5);
-    let height = |i: usize| {
-        let height = sample::height(part(i % SIDE), part(i / SIDE));
-        height.map_or(NODATA, |metres| (metres * 10.0).round() as i32)
-    };
-    let rows: Vec<i32> = (0..SIDE * SIDE).into_par_iter().map(height).collect();
+/// Decimetres of the rough ground's noise at a pitch of one cell.
+const ROUGHNESS: f64 = 100.0;
+
+fn tiled(height: impl Fn(usize, usize) -> i32 + Sync) -> Tiled<i32> {
+    let rows: Vec<i32> = (0..SIDE * SIDE).into_par_iter().map(|i| height(i % SIDE, i / SIDE)).collect();
     let mut heights = Tiled::filled([SIDE; 2], NODATA);
     for (i, height) in rows.into_iter().enumerate() {
         heights.set([i % SIDE, i / SIDE], height);
     }
     heights
+}
+
+/// The made landscape in decimetres, its sea without heights.
+fn made() -> Tiled<i32> {
+    let part = |w: usize| w as f64 / (SIDE - 1) as f64;
+    // Made here first: making it needs the workers.
+    let _ = sample::height(0.5, 0.5);
+    tiled(|x, y| sample::height(part(x), part(y)).map_or(NODATA, |metres| (metres * 10.0).round() as i32))
+}
+
+/// Rough ground in decimetres: noise of nine octaves, so that there are ridges of all sizes and no plains.
+fn rough() -> Tiled<i32> {
+    let hash = |x: usize, y: usize, octave: u32| {
+        let mut v = (x as u32).wrapping_mul(0x9E37_79B1) ^ (y as u32).wrapping_mul(0x85EB_CA6B) ^ octave;
+        v = (v ^ v >> 16).wrapping_mul(0x7FEB_352D);
+        v = (v ^ v >> 15).wrapping_mul(0x846C_A68B);
+        f64::from(v ^ v >> 16) / f64::from(u32::MAX)
+    };
+    tiled(|x, y| {
+        let height = |octave: u32| {
+            let pitch = 4usize << octave;
+            let [s, t] = [x, y].map(|w| (w % pitch) as f64 / pitch as f64);
+            let [x, y] = [x, y].map(|w| w / pitch);
+            let row = |y: usize| hash(x, y, octave) * (1.0 - s) + hash(x + 1, y, octave) * s;
+            (row(y) * (1.0 - t) + row(y + 1) * t) * (pitch as f64).powf(0.75) * ROUGHNESS
+        };
+        (0..9).map(height).sum::<f64>().round() as i32
+    })
 }
 
 /// A region whose contour has eyes: its centre and half axes, in shares of the side.
@@ -44,6 +68,7 @@ const REGIONS: [Region; 2] = [
     Region { name: "zone/mask_bay", centre: [0.235, 0.1], axes: [0.061, 0.028] },
     Region { name: "zone/mask_summit", centre: [0.55, 0.62], axes: [0.049, 0.049] },
 ];
+const ROUGH: Region = Region { name: "zone/mask_rough", centre: [0.5, 0.5], axes: [0.049, 0.049] };
 const EYES: usize = 200;
 
 impl Region {
@@ -77,7 +102,7 @@ fn whole(region: &Region, relief: &Relief, optics: &Optics) {
 
 fn main() {
     let mut criterion = Criterion::default().configure_from_args();
-    let heights = heights();
+    let heights = made();
     let mut group = criterion.benchmark_group("zone");
     group.throughput(Throughput::Elements((SIDE * SIDE) as u64)).sample_size(10);
     group.bench_function("blocks", |b| b.iter(|| Relief::new(heights.clone())));
@@ -95,10 +120,13 @@ fn main() {
     let words: Vec<String> = std::env::args().skip(1).collect();
     let filters: Vec<&String> = words.iter().filter(|word| !word.starts_with('-')).collect();
     let is_tried = words.iter().any(|word| word == "--test");
-    for region in REGIONS.iter().filter(|_| !is_tried) {
-        if filters.is_empty() || filters.iter().any(|filter| region.name.contains(filter.as_str())) {
-            whole(region, &relief, &optics);
-        }
+    let is_asked =
+        |name: &str| filters.is_empty() || filters.iter().any(|filter| name.contains(filter.as_str()));
+    for region in REGIONS.iter().filter(|region| !is_tried && is_asked(region.name)) {
+        whole(region, &relief, &optics);
+    }
+    if !is_tried && is_asked(ROUGH.name) {
+        whole(&ROUGH, &Relief::new(rough()), &optics);
     }
     criterion.final_summary();
 }

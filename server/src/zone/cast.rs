@@ -13,6 +13,10 @@
 //!
 //! Where all slopes of a block of cells are hidden, the block is passed over; how well its best seen place is hidden
 //! is bounded by its highest sample and its nearest side. What has no height neither hides nor is seen. Slopes are in quanta a metre: heights stay the integers that they are.
+//!
+//! Most of what a ray meets was found out by rays before it. Of ground that is known to be seen all over, only the
+//! highest slope is of use, and only where something else comes behind it. Such ground is *plain*: it is put off as long
+//! as more follows, and then searched from its far end, by blocks that lie below what was found so far.
 
 #![allow(
     clippy::cast_possible_truncation,
@@ -28,7 +32,7 @@ use diamantina_protocol::NODATA;
 use diamantina_protocol::zone::pack;
 use rayon::prelude::*;
 use std::f64::consts::{FRAC_1_SQRT_2, SQRT_2, TAU};
-use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 
 /// The radius of the Earth, in metres: the mean of its axes.
 const EARTH_RADIUS: f64 = 6_371_009.0;
@@ -103,7 +107,7 @@ impl Optics {
 /// The visibility of every sample, in 255ths: the largest of the triangles around it, from any of the eyes. What
 /// nobody sees has that of [`Optics::hidden`]. `None` if `progress` was told to stop.
 ///
-/// Takes a byte a sample and 1/16 more. The result does not depend on the number of threads.
+/// Takes a byte a sample and 1/5 more. The result does not depend on the number of threads.
 #[must_use]
 pub fn cast(relief: &Relief, optics: &Optics, eyes: &[Eye], progress: &Progress) -> Option<Tiled<u8>> {
     let floor = pack(optics.hidden);
@@ -122,65 +126,101 @@ pub fn cast(relief: &Relief, optics: &Optics, eyes: &[Eye], progress: &Progress)
         for i in *first..(first + AZIMUTHS_AT_ONCE).min(*azimuths) {
             // Half a step off the axes.
             let azimuth = (i as f64 + 0.5) / *azimuths as f64 * TAU;
-            Walk {
-                plane: Plane::new(relief, optics, *eye, azimuth),
-                sky: Sky::new(optics),
-                witness: &sheets,
-            }
-            .run();
+            let plane = Plane::new(relief, optics, *eye, azimuth);
+            Walk::new(&plane, optics, &sheets).run();
         }
         if *first == 0 {
             progress.advance(1);
         }
     });
-    (!progress.is_stopping()).then(|| sheets.merged(relief))
+    (!progress.is_stopping()).then(|| sheets.merged())
 }
 
 /// What has been seen so far, in 255ths: of samples, in the order of the relief's tiles, and of whole blocks.
 struct Sheets<'a> {
     floor: u8,
+    relief: &'a Relief,
     heights: &'a Tiled<i32>,
     samples: Vec<AtomicU8>,
-    blocks_size: [usize; 2],
     blocks: Vec<AtomicU8>,
-    /// The least of the samples of a block, or what it was not long ago.
-    least: Vec<AtomicU8>,
+    /// The least of the samples of each small block, or what it was not long ago; for larger ones, the least that is
+    /// known of the small ones in them.
+    least: [Vec<AtomicU8>; BLOCKS_LOG2.len()],
+    /// Whether all samples of a block of each kind are known to have heights and to be seen.
+    plain: [Vec<AtomicBool>; BLOCKS_LOG2.len()],
 }
 
 impl<'a> Sheets<'a> {
     fn new(relief: &'a Relief, floor: u8) -> Self {
         let sheet = |count: usize| (0..count).map(|_| AtomicU8::new(floor)).collect();
-        let (heights, blocks_size) = (relief.heights(), relief.blocks_size());
-        let samples = sheet(heights.items().len());
-        let blocks = blocks_size[0] * blocks_size[1];
-        Self { floor, heights, samples, blocks_size, blocks: sheet(blocks), least: sheet(blocks) }
+        let counts = std::array::from_fn(|which| relief.blocks_size(which).iter().product());
+        let heights = relief.heights();
+        Self {
+            floor,
+            relief,
+            heights,
+            samples: sheet(heights.items().len()),
+            blocks: sheet(counts[0]),
+            least: counts.map(sheet),
+            plain: counts.map(|count| (0..count).map(|_| AtomicBool::new(false)).collect()),
+        }
     }
 
-    /// The least that is known of the samples of a block.
-    fn least(&self, [x, y]: [usize; 2]) -> u8 {
+    /// What is known of the samples of a small block.
+    fn of_block(&self, [x, y]: [usize; 2]) -> impl Iterator<Item = u8> {
         let side = 1usize << BLOCKS_LOG2[0];
         let [columns, rows] = [0, 1].map(|axis| {
             let first = [x, y][axis] * side;
             first..=(first + side).min(self.heights.size()[axis] - 1)
         });
-        let mut least = u8::MAX;
-        for row in rows.map(|y| self.heights.offset(1, y)) {
-            for column in columns.clone().map(|x| self.heights.offset(0, x)) {
-                least = least.min(self.samples[row + column].load(Ordering::Relaxed));
-            }
-        }
-        least
+        rows.map(|y| self.heights.offset(1, y)).flat_map(move |row| {
+            let columns = columns.clone().map(|x| self.heights.offset(0, x));
+            columns.map(move |column| self.samples[row + column].load(Ordering::Relaxed))
+        })
     }
 
-    fn merged(self, relief: &Relief) -> Tiled<u8> {
+    /// The place of a block in the sheets of its kind.
+    fn index(&self, which: usize, [x, y]: [usize; 2]) -> usize {
+        y * self.relief.blocks_size(which)[0] + x
+    }
+
+    /// The blocks of the next smaller kind in a larger block.
+    fn parts(&self, which: usize, block: [usize; 2]) -> impl Iterator<Item = [usize; 2]> {
+        let size = self.relief.blocks_size(which - 1);
+        let log2 = BLOCKS_LOG2[which] - BLOCKS_LOG2[which - 1];
+        let [columns, rows] =
+            [0, 1].map(|axis| block[axis] << log2..((block[axis] + 1) << log2).min(size[axis]));
+        rows.flat_map(move |y| columns.clone().map(move |x| [x, y]))
+    }
+
+    /// The least that is known of what is in a block, or that was not long ago.
+    fn least(&self, which: usize, block: [usize; 2]) -> u8 {
+        let i = self.index(which, block);
+        let least = self.least[which][i].load(Ordering::Relaxed);
+        if which == 0 { least.max(self.blocks[i].load(Ordering::Relaxed)) } else { least }
+    }
+
+    /// Whether so much is known of all that is in a block of a larger kind.
+    fn knows(&self, which: usize, block: [usize; 2], share: u8) -> bool {
+        if self.least(which, block) >= share {
+            return true;
+        }
+        let least = self.parts(which, block).map(|part| self.least(which - 1, part)).min().unwrap_or(u8::MAX);
+        self.least[which][self.index(which, block)].store(least, Ordering::Relaxed);
+        least >= share
+    }
+
+    fn merged(self) -> Tiled<u8> {
+        let relief = self.relief;
         let mut samples = self.heights.like(self.samples.into_iter().map(AtomicU8::into_inner).collect());
         let side = 1usize << BLOCKS_LOG2[0];
         let [width, height] = relief.size();
+        let columns = relief.blocks_size(0)[0];
         for (i, share) in self.blocks.into_iter().map(AtomicU8::into_inner).enumerate() {
             if share == self.floor {
                 continue;
             }
-            let [x, y] = [i % self.blocks_size[0] * side, i / self.blocks_size[0] * side];
+            let [x, y] = [i % columns * side, i / columns * side];
             for y in y..=(y + side).min(height - 1) {
                 for x in x..=(x + side).min(width - 1) {
                     samples.set([x, y], share.max(samples.at([x, y])));
@@ -199,6 +239,19 @@ trait Witness {
     fn knows_block(&self, _block: [usize; 2], _share: f64) -> bool {
         false
     }
+
+    /// The same of blocks of a larger kind, for a share of at most [`BLOCK_SHARE_MAX`].
+    fn knows_larger(&self, _which: usize, _blocks: [[usize; 2]; 2], _share: f64) -> bool {
+        false
+    }
+
+    /// Whether all samples of a block are known to have heights and to be seen.
+    fn is_plain(&self, _which: usize, _block: [usize; 2]) -> bool {
+        false
+    }
+
+    /// Finds out whether a block of the smallest kind is plain, and then whether those are that it is in.
+    fn look(&self, _block: [usize; 2]) {}
 
     /// Whether all four samples of a cell, by their place among the heights, are known to be seen.
     fn knows_seen(&self, _corners: [usize; 4]) -> bool {
@@ -231,19 +284,45 @@ impl Witness for &Sheets<'_> {
                     columns.iter().for_each(|column| raise(&self.samples[row + column]));
                 }
             }
-            Region::Block([x, y]) => raise(&self.blocks[y * self.blocks_size[0] + x]),
+            Region::Block(block) => raise(&self.blocks[self.index(0, block)]),
         }
     }
 
     fn knows_block(&self, block: [usize; 2], share: f64) -> bool {
         let share = stepped(share, self.floor);
-        let known = &self.least[block[1] * self.blocks_size[0] + block[0]];
+        let known = &self.least[0][self.index(0, block)];
         if known.load(Ordering::Relaxed) >= share {
             return true;
         }
-        let least = self.least(block);
+        let least = self.of_block(block).min().unwrap_or(u8::MAX);
         known.store(least, Ordering::Relaxed);
         least >= share
+    }
+
+    fn knows_larger(&self, which: usize, blocks: [[usize; 2]; 2], share: f64) -> bool {
+        let share = stepped(share, self.floor);
+        blocks.iter().all(|block| self.knows(which, *block, share))
+    }
+
+    fn is_plain(&self, which: usize, block: [usize; 2]) -> bool {
+        self.plain[which][self.index(which, block)].load(Ordering::Relaxed)
+    }
+
+    fn look(&self, mut block: [usize; 2]) {
+        let is_seen = |block| self.of_block(block).all(|share| share == u8::MAX);
+        if self.is_plain(0, block) || self.relief.has_holes(0, [block; 2]) || !is_seen(block) {
+            return;
+        }
+        self.least[0][self.index(0, block)].store(u8::MAX, Ordering::Relaxed);
+        for which in 0..BLOCKS_LOG2.len() {
+            if which > 0 {
+                block = block.map(|w| w >> (BLOCKS_LOG2[which] - BLOCKS_LOG2[which - 1]));
+                if !self.parts(which, block).all(|part| self.is_plain(which - 1, part)) {
+                    return;
+                }
+            }
+            self.plain[which][self.index(which, block)].store(true, Ordering::Relaxed);
+        }
     }
 
     fn knows_seen(&self, corners: [usize; 4]) -> bool {
@@ -288,7 +367,8 @@ pub struct Seen {
 /// Follows the rays of one azimuth (radians from the x axis to the y axis) and shows what is seen or nearly, in order of
 /// distance; what has a share of [`Optics::hidden`] or less is left out.
 pub fn walk(relief: &Relief, optics: &Optics, eye: Eye, azimuth: f64, visit: impl FnMut(Seen)) {
-    Walk { plane: Plane::new(relief, optics, eye, azimuth), sky: Sky::new(optics), witness: visit }.run();
+    let plane = Plane::new(relief, optics, eye, azimuth);
+    Walk::new(&plane, optics, visit).run();
 }
 
 /// The vertical plane of an azimuth. Columns of cells are crossed one by one along the major axis, the one along
@@ -388,6 +468,51 @@ impl<'a> Plane<'a> {
     fn sample(&self, [k, j]: [usize; 2]) -> [usize; 2] {
         if self.major == 0 { [k, j] } else { [j, k] }
     }
+
+    /// A post's place in a cell, from its first corner.
+    fn local(&self, [k, j]: [usize; 2], post: &Post) -> [f64; 2] {
+        [self.eye[0] + self.sign * post.u - k as f64, post.minor - j as f64]
+    }
+
+    /// On which sides of a cell's diagonal, and how far, two posts are, and the post between them where the plane crosses
+    /// it. It rises from the first corner or falls to the second.
+    #[inline(always)]
+    fn diagonal(&self, cell: [usize; 2], rising: bool, [from, to]: [&Post; 2]) -> ([f64; 2], Option<Post>) {
+        let [a, b] = [from, to].map(|post| {
+            let [s, t] = self.local(cell, post);
+            if rising { s - t } else { s + t - 1.0 }
+        });
+        let cross = || self.post((from.u - a * self.across[usize::from(!rising)]).clamp(from.u, to.u));
+        ([a, b], (a * b < 0.0).then(cross))
+    }
+
+    /// The line before a column, seen from the eye.
+    fn line_before(&self, column: usize) -> usize {
+        if self.sign > 0.0 { column } else { column.wrapping_add(1) }
+    }
+
+    /// The line after a column, seen from the eye.
+    fn line_after(&self, column: usize) -> usize {
+        if self.sign > 0.0 { column + 1 } else { column }
+    }
+
+    /// The column beyond a line.
+    fn column_beyond(&self, line: usize) -> usize {
+        if self.sign > 0.0 { line } else { line.wrapping_sub(1) }
+    }
+
+    /// The line beyond a column of blocks.
+    fn line_beyond(&self, which: usize, block: usize) -> usize {
+        let first = block << BLOCKS_LOG2[which];
+        if self.sign > 0.0 { (first + (1 << BLOCKS_LOG2[which])).min(self.sizes[0] - 1) } else { first }
+    }
+
+    /// What the plane crosses of a column of blocks between two posts: it leans at most one cell a column, so it is
+    /// one block or two.
+    fn blocks(&self, which: usize, block: usize, posts: [&Post; 2]) -> [[usize; 2]; 2] {
+        let row = |post: &Post| (post.minor.max(0.0) as usize).min(self.sizes[1] - 2) >> BLOCKS_LOG2[which];
+        posts.map(|post| self.sample([block, row(post)]))
+    }
 }
 
 /// The slopes that are still open: all above the horizon, and some windows below it, from low to high.
@@ -410,6 +535,11 @@ struct Sky<'a> {
 /// Above this a slope is above another by more than rounding.
 fn threshold(slope: f64) -> f64 {
     if slope.is_infinite() { slope } else { slope + SAME * (1.0 + slope.abs()) }
+}
+
+/// Below this a slope is below another by more than rounding.
+fn beneath(slope: f64) -> f64 {
+    if slope.is_infinite() { slope } else { slope - 2.0 * SAME * (1.0 + slope.abs()) }
 }
 
 fn is_above(a: f64, b: f64) -> bool {
@@ -475,6 +605,14 @@ impl<'a> Sky<'a> {
         if slope.is_infinite() { 1.0 } else { angle * (1.0 + slope * slope) / gap }
     }
 
+    /// Closes the slopes below one, where no windows are open.
+    fn raise(&mut self, slope: f64) {
+        if slope > self.threshold {
+            self.horizon = slope;
+            self.threshold = threshold(slope);
+        }
+    }
+
     /// Closes the slopes between two.
     fn cover(&mut self, [lo, hi]: [f64; 2]) {
         if lo < self.ajar && self.windows.iter().any(|window| overlap([lo, hi], *window)) {
@@ -512,9 +650,11 @@ impl<'a> Sky<'a> {
 }
 
 struct Walk<'a, W> {
-    plane: Plane<'a>,
+    plane: &'a Plane<'a>,
     sky: Sky<'a>,
     witness: W,
+    /// Whether a cell was crossed in the last small block that nobody has seen yet.
+    has_unseen: bool,
 }
 
 /// The whole number below, for numbers above -2.
@@ -523,16 +663,115 @@ fn floor(w: f64) -> i32 {
     (w + 2.0) as i32 - 2
 }
 
-impl<W: Witness> Walk<'_, W> {
+impl<'a, W: Witness> Walk<'a, W> {
+    fn new(plane: &'a Plane<'a>, optics: &'a Optics, witness: W) -> Self {
+        Self { plane, sky: Sky::new(optics), witness, has_unseen: false }
+    }
+
     fn run(&mut self) {
-        let columns = self.plane.sizes[0] - 1;
-        let eye = self.plane.eye[0];
-        let forward = self.plane.sign > 0.0;
+        let plane = self.plane;
+        let columns = plane.sizes[0] - 1;
+        let eye = plane.eye[0];
         // A column number of -1 wraps, and is beyond all columns like any other.
-        let mut column = if forward { eye.floor() as usize } else { (eye.ceil() as usize).wrapping_sub(1) };
-        let mut from = self.plane.post(0.0);
+        let mut column =
+            if plane.sign > 0.0 { eye.floor() as usize } else { (eye.ceil() as usize).wrapping_sub(1) };
+        let mut from = plane.post(0.0);
+        // Where plain ground begins that the horizon does not know yet.
+        let mut plain = None;
+        let [mut looked, mut tried] = [[usize::MAX; BLOCKS_LOG2.len()]; 2];
+        'blocks: while column < columns {
+            // A block of plain ground, as large as there is.
+            let mut beyond = None;
+            for which in 0..BLOCKS_LOG2.len() {
+                let block = column >> BLOCKS_LOG2[which];
+                if looked[which] == block {
+                    break;
+                }
+                looked[which] = block;
+                let line = plane.line_beyond(which, block);
+                let to = plane.at_line(line);
+                if !self.is_plain(which, block, [&from, &to]) {
+                    break;
+                }
+                beyond = Some((line, to));
+            }
+            if let Some((line, to)) = beyond {
+                plain.get_or_insert((plane.line_before(column), from));
+                (column, from) = (plane.column_beyond(line), to);
+                continue;
+            }
+            if let Some(near) = plain.take() {
+                self.settle(near, (plane.line_before(column), from));
+            }
+            for which in (0..BLOCKS_LOG2.len()).rev() {
+                let block = column >> BLOCKS_LOG2[which];
+                if tried[which] == block {
+                    continue;
+                }
+                tried[which] = block;
+                let line = plane.line_beyond(which, block);
+                let to = plane.at_line(line);
+                if self.is_over(which, block, [&from, &to]) {
+                    (column, from) = (plane.column_beyond(line), to);
+                    continue 'blocks;
+                }
+            }
+            let line = plane.line_beyond(0, column >> BLOCKS_LOG2[0]);
+            match self.block(column, from, line) {
+                Some(to) => (column, from) = (plane.column_beyond(line), to),
+                None => return,
+            }
+        }
+    }
+
+    /// Crosses a column of small blocks from a column and post on; the post at its far line if that is over the relief.
+    fn block(&mut self, mut column: usize, near: Post, far: usize) -> Option<Post> {
+        let plane = self.plane;
+        let block = column >> BLOCKS_LOG2[0];
+        self.has_unseen = false;
+        let mut from = near;
+        loop {
+            let line = plane.line_after(column);
+            let to = plane.at_line(line);
+            if !self.column::<false>(column, [&from, &to]) {
+                return None;
+            }
+            from = to;
+            if line == far {
+                break;
+            }
+            column = plane.column_beyond(line);
+        }
+        // Most looks at blocks that are not plain are saved so.
+        if !self.has_unseen {
+            plane.blocks(0, block, [&near, &from]).into_iter().for_each(|block| self.witness.look(block));
+        }
+        Some(from)
+    }
+
+    /// Whether all that the plane crosses in a column of blocks is known to be seen, so that it only hides what is
+    /// behind it, and whether it does so by the horizon alone: above all windows, and with the relief beyond it.
+    fn is_plain(&self, which: usize, block: usize, posts: [&Post; 2]) -> bool {
+        let plane = self.plane;
+        if self.sky.after_hole || !(0.0..=(plane.sizes[1] - 1) as f64).contains(&posts[1].minor) {
+            return false;
+        }
+        let blocks = plane.blocks(which, block, posts);
+        blocks.iter().all(|block| self.witness.is_plain(which, *block))
+            && (self.sky.windows.is_empty()
+                || lowest_slope(f64::from(plane.relief.bounds(which, blocks)[0]), posts) >= self.sky.ajar)
+    }
+
+    /// Raises the horizon over plain ground between two lines, the nearer first: from far to near, since what is
+    /// far is mostly seen at higher slopes, and what lies lower need not be looked at.
+    fn settle(&mut self, (start, near): (usize, Post), (mut line, mut to): (usize, Post)) {
+        let forward = self.plane.sign > 0.0;
+        let before = self.sky.threshold;
         let mut tried = [usize::MAX; BLOCKS_LOG2.len()];
-        'columns: while column < columns {
+        let plane = self.plane;
+        let post = |line| if line == start { near } else { plane.at_line(line) };
+        'columns: while line != start {
+            let column = if forward { line - 1 } else { line };
             for which in (0..BLOCKS_LOG2.len()).rev() {
                 let block = column >> BLOCKS_LOG2[which];
                 if tried[which] == block {
@@ -540,31 +779,34 @@ impl<W: Witness> Walk<'_, W> {
                 }
                 tried[which] = block;
                 let first = block << BLOCKS_LOG2[which];
-                let line = if forward { (first + (1 << BLOCKS_LOG2[which])).min(columns) } else { first };
-                let to = self.plane.at_line(line);
-                if self.is_over(which, block, [&from, &to]) {
-                    from = to;
-                    column = if forward { line } else { line.wrapping_sub(1) };
+                let nearer =
+                    if forward { first.max(start) } else { (first + (1 << BLOCKS_LOG2[which])).min(start) };
+                let from = post(nearer);
+                let [_, high] = plane.relief.bounds(which, plane.blocks(which, block, [&from, &to]));
+                if highest_slope(f64::from(high), [&from, &to]) <= self.sky.threshold {
+                    (line, to) = (nearer, from);
                     continue 'columns;
                 }
             }
-            let to = self.plane.at_line(if forward { column + 1 } else { column });
-            if !self.column(column, [&from, &to]) {
-                return;
+            line = if forward { line - 1 } else { line + 1 };
+            let from = post(line);
+            let highest = self.sky.horizon;
+            self.column::<true>(column, [&from, &to]);
+            // Of slopes that are the same the nearest counts, as if they had come in their order.
+            if is_above(highest, self.sky.horizon) {
+                self.sky.horizon = highest;
             }
-            from = to;
-            column = if forward { column + 1 } else { column.wrapping_sub(1) };
+            self.sky.threshold = before.max(beneath(self.sky.horizon));
+            to = from;
         }
+        self.sky.threshold = threshold(self.sky.horizon);
     }
 
     /// Whether a column of blocks may be passed over, because all that the plane crosses in it is hidden: it is told as
-    /// one then. Large blocks bound little, so they are passed over only if nothing is to be told; small ones
-    /// also if nothing new is.
+    /// one then. Large blocks bound little, so they are passed over only if nothing is to be told, or nothing new.
     fn is_over(&mut self, which: usize, block: usize, posts: [&Post; 2]) -> bool {
-        let plane = &self.plane;
-        // The plane leans at most one cell a column: it crosses one block or two.
-        let row = |post: &Post| (post.minor.max(0.0) as usize).min(plane.sizes[1] - 2) >> BLOCKS_LOG2[which];
-        let blocks = posts.map(|post| plane.sample([block, row(post)]));
+        let plane = self.plane;
+        let blocks = plane.blocks(which, block, posts);
         let [low, high] = plane.relief.bounds(which, blocks);
         if low > high {
             self.sky.after_hole = true;
@@ -578,7 +820,11 @@ impl<W: Witness> Walk<'_, W> {
         let share = self.sky.share(slopes);
         if share > self.sky.least {
             if which > 0 {
-                return false;
+                let is_known = share <= BLOCK_SHARE_MAX && self.witness.knows_larger(which, blocks, share);
+                if is_known {
+                    self.sky.after_hole = has_holes;
+                }
+                return is_known;
             }
             if share > BLOCK_SHARE_MAX {
                 let is_known = blocks.iter().all(|block| self.witness.knows_block(*block, share));
@@ -596,7 +842,7 @@ impl<W: Witness> Walk<'_, W> {
     }
 
     /// Crosses a column; whether the plane is still over the relief at its end.
-    fn column(&mut self, column: usize, [from, to]: [&Post; 2]) -> bool {
+    fn column<const PLAIN: bool>(&mut self, column: usize, [from, to]: [&Post; 2]) -> bool {
         let low = from.minor.min(to.minor);
         // It leans at most one cell a column, so it crosses one line between rows at most.
         let line = f64::from(floor(low) + 1);
@@ -604,14 +850,15 @@ impl<W: Witness> Walk<'_, W> {
             let cross = (line - self.plane.eye[1]) * self.plane.unlean;
             if cross > from.u && cross < to.u {
                 let cross = self.plane.post(cross);
-                return self.in_row(column, [from, &cross]) && self.in_row(column, [&cross, to]);
+                return self.in_row::<PLAIN>(column, [from, &cross])
+                    && self.in_row::<PLAIN>(column, [&cross, to]);
             }
         }
-        self.in_row(column, [from, to])
+        self.in_row::<PLAIN>(column, [from, to])
     }
 
     /// Crosses a column between lines of rows, too; whether that is over the relief.
-    fn in_row(&mut self, column: usize, [from, to]: [&Post; 2]) -> bool {
+    fn in_row<const PLAIN: bool>(&mut self, column: usize, [from, to]: [&Post; 2]) -> bool {
         if from.u >= to.u {
             return true;
         }
@@ -620,13 +867,13 @@ impl<W: Witness> Walk<'_, W> {
             return false;
         }
         let row = (middle as usize).min(self.plane.sizes[1] - 2);
-        self.cell([column, row], [from, to]);
+        self.cell::<PLAIN>([column, row], [from, to]);
         true
     }
 
-    /// Crosses a cell: one small triangle or two.
-    fn cell(&mut self, [k, j]: [usize; 2], [from, to]: [&Post; 2]) {
-        let plane = &self.plane;
+    /// Crosses a cell: one small triangle or two. Of a plain one, only the horizon above it is of use.
+    fn cell<const PLAIN: bool>(&mut self, [k, j]: [usize; 2], [from, to]: [&Post; 2]) {
+        let plane = self.plane;
         let (major, minor) = (plane.major, 1 - plane.major);
         let columns = [k, k + 1].map(|k| plane.heights.offset(major, k));
         let rows = [j, j + 1].map(|j| plane.heights.offset(minor, j));
@@ -635,6 +882,13 @@ impl<W: Witness> Walk<'_, W> {
         let heights = places.map(|i| items[i]);
         let [a, b, c, d] = heights;
         let high = a.max(b).max(c.max(d));
+        let posts = [from, to];
+        if PLAIN {
+            if highest_slope(f64::from(high), posts) > self.sky.threshold {
+                self.raise([k, j], heights, posts);
+            }
+            return;
+        }
         let mut low = a.min(b).min(c.min(d));
         let has_hole = low == NODATA;
         if has_hole {
@@ -644,7 +898,6 @@ impl<W: Witness> Walk<'_, W> {
             }
             low = heights.iter().copied().filter(|h| *h != NODATA).fold(high, i32::min);
         }
-        let posts = [from, to];
         let slopes = [lowest_slope(f64::from(low), posts), highest_slope(f64::from(high), posts)];
         if !self.sky.shows(slopes) {
             // Its triangles are not looked at one by one.
@@ -653,6 +906,7 @@ impl<W: Witness> Walk<'_, W> {
                 return;
             }
             let share = self.sky.share(slopes);
+            self.has_unseen |= share <= BLOCK_SHARE_MAX;
             if share > self.sky.least {
                 self.witness.note(Seen { region: Region::Cell(plane.sample([k, j])), slopes, share });
             }
@@ -662,20 +916,37 @@ impl<W: Witness> Walk<'_, W> {
         self.triangles([k, j], heights, posts, is_known);
     }
 
+    /// Raises the horizon over the triangles of a plain cell, to the very slopes that [`Self::triangles`] finds.
+    fn raise(&mut self, cell: [usize; 2], heights: [i32; 4], [from, to]: [&Post; 2]) {
+        let plane = self.plane;
+        let rising = (cell[0] + cell[1]).is_multiple_of(2);
+        let [h0, h1, h2, h3] = heights.map(f64::from);
+        // Chosen without branches: nothing foretells in which triangle a ray is.
+        let slope = |post: &Post, is_left: bool| {
+            let is_lower = rising != is_left;
+            let at = if is_lower || rising { h0 } else { h1 + h3 - h2 };
+            let along = if is_lower { h1 - h0 } else { h2 - h3 };
+            let across = if is_left { h3 - h0 } else { h2 - h1 };
+            let [s, t] = plane.local(cell, post);
+            post.slope(at + along * s + across * t)
+        };
+        let ([a, b], cross) = plane.diagonal(cell, rising, [from, to]);
+        let cross = cross.unwrap_or(*to);
+        for ([from, to], side) in [([from, &cross], if a == 0.0 { b } else { a }), ([&cross, to], b)] {
+            if from.u < to.u {
+                let ends = [from, to].map(|post| slope(post, side < 0.0));
+                self.sky.raise(if ends[0] < ends[1] { ends[1] } else { ends[0] });
+            }
+        }
+    }
+
     /// Crosses the triangles of a cell. If it is known that all of them are seen, they only hide what is behind them.
     fn triangles(&mut self, [k, j]: [usize; 2], heights: [i32; 4], [from, to]: [&Post; 2], is_known: bool) {
-        let plane = &self.plane;
+        let plane = self.plane;
         let rising = (k + j).is_multiple_of(2);
         let corners = [[k, j], [k + 1, j], [k + 1, j + 1], [k, j + 1]].map(|c| plane.sample(c));
-        let local = |post: &Post| [plane.eye[0] + plane.sign * post.u - k as f64, post.minor - j as f64];
-        // Which side of the diagonal, and how far.
-        let side = |[s, t]: [f64; 2]| if rising { s - t } else { s + t - 1.0 };
-        let [a, b] = [side(local(from)), side(local(to))];
-        let cross = if a * b < 0.0 {
-            plane.post((from.u - a * plane.across[usize::from(!rising)]).clamp(from.u, to.u))
-        } else {
-            *to
-        };
+        let ([a, b], cross) = plane.diagonal([k, j], rising, [from, to]);
+        let cross = cross.unwrap_or(*to);
         let [h0, h1, h2, h3] = heights.map(f64::from);
         for ([from, to], side) in [([from, &cross], if a == 0.0 { b } else { a }), ([&cross, to], b)] {
             if from.u >= to.u {
@@ -693,7 +964,7 @@ impl<W: Witness> Walk<'_, W> {
                 continue;
             }
             let ends = [from, to].map(|post| {
-                let [s, t] = local(post);
+                let [s, t] = plane.local([k, j], post);
                 post.slope(at + along * s + across * t)
             });
             let slopes = if ends[0] < ends[1] { ends } else { [ends[1], ends[0]] };

@@ -87,9 +87,9 @@ impl Relief {
         self.heights.size()
     }
 
-    /// Blocks of the smallest kind along x and y.
-    pub(super) fn blocks_size(&self) -> [usize; 2] {
-        self.blocks[0].size
+    /// Blocks of a kind along x and y.
+    pub(super) fn blocks_size(&self, which: usize) -> [usize; 2] {
+        self.blocks[which].size
     }
 
     /// The height of a sample.

@@ -267,6 +267,58 @@ proptest! {
     }
 }
 
+/// A mask by rays that know nothing of each other.
+fn by_each_ray(relief: &Relief, optics: &Optics, eyes: &[Eye]) -> Vec<u8> {
+    let [width, height] = relief.size();
+    let floor = pack(optics.hidden);
+    let mut mask = vec![floor; width * height];
+    for eye in eyes {
+        let azimuths = optics.azimuths(relief, eye.place);
+        for i in 0..azimuths {
+            walk(relief, optics, *eye, (i as f64 + 0.5) / azimuths as f64 * TAU, |seen| {
+                let share = stepped(seen.share, floor);
+                let mut raise = |[x, y]: [usize; 2]| mask[y * width + x] = mask[y * width + x].max(share);
+                let (first, side) = match seen.region {
+                    Region::Triangle(corners) => return corners.into_iter().for_each(raise),
+                    Region::Cell(cell) => (cell, 1),
+                    Region::Block(block) => (block.map(|b| b << BLOCKS_LOG2[0]), 1 << BLOCKS_LOG2[0]),
+                };
+                for y in first[1]..=(first[1] + side).min(height - 1) {
+                    (first[0]..=(first[0] + side).min(width - 1)).for_each(|x| raise([x, y]));
+                }
+            });
+        }
+    }
+    mask
+}
+
+/// Where blocks of all kinds become plain, and where holes open windows.
+#[test]
+fn what_rays_know_of_others_changes_no_mask_of_rough_ground() {
+    let side = 200usize;
+    let optics = Optics { epsilon: 0.004, hidden: 0.05, angle: 1e-3, ..ROUGH };
+    let mut heights = rough(side);
+    for is_whole in [true, false] {
+        if !is_whole {
+            // Two lakes, one of them around an eye.
+            let (x, y) = (|i: usize| i % side, |i: usize| i / side);
+            let is_lake = |i: usize| {
+                x(i).abs_diff(30) + y(i).abs_diff(100) < 12 || x(i).abs_diff(120) + y(i).abs_diff(60) < 9
+            };
+            (0..side * side).filter(|i| is_lake(*i)).for_each(|i| heights[i] = NODATA);
+        }
+        let relief = Relief::from_rows([side; 2], &heights);
+        let places = [[30.2, 100.7], [100.0, 100.0], [170.9, 20.1], [199.0, 199.0]];
+        let eyes = places.map(|place| Eye { place, height: 3.2e6 }).to_vec();
+        let twice = [eyes.clone(), eyes.clone()].concat();
+        let mask = cast(&relief, &optics, &twice, &Progress::hidden()).unwrap();
+        let mask: Vec<u8> = mask.rows().collect();
+        assert!(mask == by_each_ray(&relief, &optics, &eyes), "whole: {is_whole}");
+        let seen = mask.iter().filter(|share| **share == u8::MAX).count();
+        assert!((side * side / 8..side * side).contains(&seen), "{seen} are seen");
+    }
+}
+
 #[test]
 fn masks_do_not_depend_on_threads_and_hold_what_each_azimuth_shows() {
     let side = 150usize;
@@ -281,18 +333,7 @@ fn masks_do_not_depend_on_threads_and_hold_what_each_azimuth_shows() {
     let whole = cast(&relief, &optics, &eyes, &Progress::hidden()).unwrap();
     let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     assert_eq!(one.install(|| cast(&relief, &optics, &eyes, &Progress::hidden())).unwrap(), whole);
-    let mut expected = vec![pack(optics.hidden); side * side];
-    for eye in &eyes {
-        let azimuths = optics.azimuths(&relief, eye.place);
-        for i in 0..azimuths {
-            walk(&relief, &optics, *eye, (i as f64 + 0.5) / azimuths as f64 * TAU, |seen| {
-                for [x, y] in inside(&relief, seen.region).into_iter().flatten() {
-                    let here = &mut expected[y * side + x];
-                    *here = (*here).max(stepped(seen.share, pack(optics.hidden)));
-                }
-            });
-        }
-    }
+    let expected = by_each_ray(&relief, &optics, &eyes);
     assert_eq!(whole.rows().collect::<Vec<u8>>(), expected);
     let seen = whole.rows().filter(|v| *v == 255).count();
     assert!((side * side / 20..side * side * 19 / 20).contains(&seen), "{seen} of {} are seen", side * side);
@@ -341,7 +382,7 @@ fn rounding_opens_no_windows_in_a_surface_without_holes() {
     let eye = Eye { place, height: relief.height(place).unwrap() + 3000.0 };
     for i in 0..20_000 {
         let plane = Plane::new(&relief, &ROUGH, eye, f64::from(i) / 20_000.0 * TAU + 1e-4);
-        let mut walk = Walk { plane, sky: Sky::new(&ROUGH), witness: |_: Seen| {} };
+        let mut walk = Walk::new(&plane, &ROUGH, |_: Seen| {});
         walk.run();
         assert!(walk.sky.windows.is_empty(), "azimuth {i}: {:?}", walk.sky.windows);
     }
@@ -359,7 +400,7 @@ fn rounding_opens_no_windows_beside_holes() {
     let mut opened = 0;
     for i in 0..20_000 {
         let plane = Plane::new(&relief, &ROUGH, eye, f64::from(i) / 20_000.0 * TAU + 1e-4);
-        let mut walk = Walk { plane, sky: Sky::new(&ROUGH), witness: |_: Seen| {} };
+        let mut walk = Walk::new(&plane, &ROUGH, |_: Seen| {});
         walk.run();
         opened += walk.sky.windows.len();
         let slit = walk.sky.windows.iter().find(|[least, most]| most - least < 1e-9 * (1.0 + most.abs()));
