@@ -94,6 +94,7 @@ impl Encoder {
     }
 
     /// Appends a symbol that takes the probabilities `start..start + share` of [`TOTAL`]; share above 0.
+    #[inline]
     pub fn symbol(&mut self, lane: u8, start: u16, share: u16) {
         self.steps.push(Step { start, share, bits: 0, lane });
     }
@@ -115,6 +116,7 @@ impl Encoder {
     }
 
     /// Appends one bit under an adaptive context.
+    #[inline]
     pub fn bit(&mut self, context: &mut Context, bit: bool) {
         let zero = context.probability();
         if bit {
@@ -160,8 +162,9 @@ impl Encoder {
         let mut states = [beginning(lanes); 2];
         let mut words: Vec<u16> = Vec::with_capacity(self.steps.len());
         let reciprocals = &SHARES.reciprocals;
+        let lane_mask = lanes - 1;
         for step in self.steps.iter().rev() {
-            let state = &mut states[usize::from(step.lane) % lanes];
+            let state = &mut states[usize::from(step.lane) & lane_mask & 1];
             let (share, precision) =
                 if step.share == 0 { (1, u32::from(step.bits)) } else { (u32::from(step.share), PRECISION) };
             // The state after the step must stay below 2^32.

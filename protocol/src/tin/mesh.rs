@@ -5,7 +5,7 @@
 //! a front can be followed without choices.
 
 use super::walk::{Beyond, NONE, Point, Seed, Square, Within, cross};
-use super::{Patch, PatchError, TRIANGLES_MAX};
+use super::{Neighbours, Patch, PatchError, TRIANGLES_MAX};
 
 /// A triangle's corner: four times its number, and 0 to 2. So no number needs a division; every fourth is none.
 type Corner = u32;
@@ -26,11 +26,11 @@ fn corners(triangles: usize) -> impl Iterator<Item = Corner> {
 }
 
 /// A mesh to be sent. Gates are marked with the corner of the triangle beyond where the gate starts, or [`NONE`].
-pub(super) struct Mesh {
-    /// The fan of each corner.
+pub(super) struct Mesh<'a> {
+    /// The fan of each corner: its vertex, or where that has several, for each but one another number.
     fans: Vec<u32>,
     /// Across the edge from a corner to the next one: the corner where the neighbour's edge starts, or [`NONE`].
-    across: Vec<Corner>,
+    across: &'a [Corner],
     /// The place of each fan.
     points: Vec<Point>,
     /// The walk's name of each fan, [`NONE`] before it is met, and how many have been.
@@ -43,21 +43,40 @@ pub(super) struct Mesh {
     holes: bool,
 }
 
-impl Mesh {
+impl<'a> Mesh<'a> {
     /// The mesh of a patch whose vertices lie at `points`.
-    pub(super) fn new(patch: &Patch, points: &[Point], square: &Square) -> Result<Self, PatchError> {
+    pub(super) fn new(
+        patch: &Patch,
+        neighbours: &'a Neighbours,
+        points: &[Point],
+        square: &Square,
+    ) -> Result<Self, PatchError> {
         if patch.triangles.len() > TRIANGLES_MAX {
             return Err(PatchError::Triangles(patch.triangles.len()));
         }
         let within: Vec<Within> =
             points.iter().map(|p| square.within(i64::from(p.x), i64::from(p.y))).collect();
         check(patch, points, &within)?;
-        let across = across(&patch.triangles, points.len())?;
-        let vertex = |corner: Corner| patch.triangles[corner as usize / STRIDE][corner as usize % STRIDE];
-        let (fans, places) = fans(&patch.triangles, &across, points);
-        let outer = |corner: Corner| within[vertex(corner) as usize].outer;
-        let is_inner = |corner: Corner| outer(corner) & outer(next(corner)) == 0;
-        let holes = corners(patch.triangles.len()).any(|c| across[c as usize] == NONE && is_inner(c));
+        let across = neighbours.across();
+        if let Some([a, b]) = neighbours.repeated {
+            return Err(PatchError::Edge(a, b));
+        }
+        let mut fans = vec![NONE; STRIDE * patch.triangles.len()];
+        for (four, triangle) in fans.as_chunks_mut::<STRIDE>().0.iter_mut().zip(&patch.triangles) {
+            four[..3].copy_from_slice(triangle);
+        }
+        let (mut gaps, mut is_torn, mut holes) = (vec![false; points.len()], false, false);
+        for (four, triangle) in across.as_chunks::<STRIDE>().0.iter().zip(&patch.triangles) {
+            for i in (0..3).filter(|i| four[*i] == NONE) {
+                let ends = [triangle[i], triangle[(i + 1) % 3]].map(|v| v as usize);
+                holes |= within[ends[0]].outer & within[ends[1]].outer == 0;
+                is_torn |= std::mem::replace(&mut gaps[ends[0]], true);
+            }
+        }
+        let mut places = points.to_vec();
+        if is_torn {
+            separate(&patch.triangles, across, &mut fans, &mut places);
+        }
         Ok(Self {
             across,
             names: vec![NONE; places.len()],
@@ -113,8 +132,13 @@ impl Mesh {
     }
 }
 
-/// For each corner the one across the edge to the next corner, where the neighbour's edge starts.
-fn across(triangles: &[[u32; 3]], count: usize) -> Result<Vec<Corner>, PatchError> {
+/// For each corner of a patch with so many vertices the one across the edge to the next corner, where the neighbour's
+/// edge starts, or [`NONE`]; and an edge with two triangles on the same side, if there is one. Nothing if it is no patch
+/// for another reason.
+pub(super) fn across(triangles: &[[u32; 3]], count: usize) -> (Vec<Corner>, Option<[u32; 2]>) {
+    if triangles.len() > TRIANGLES_MAX || triangles.as_flattened().iter().any(|v| *v as usize >= count) {
+        return (Vec::new(), None);
+    }
     // The corners of each vertex, with where their edges end. One place too far to begin with: filling the list
     // moves each to where it belongs.
     let mut starts = vec![0u32; count + 2];
@@ -135,21 +159,28 @@ fn across(triangles: &[[u32; 3]], count: usize) -> Result<Vec<Corner>, PatchErro
         }
     }
     let edges_of = |v: u32| &edges[starts[v as usize] as usize..starts[v as usize + 1] as usize];
-    let mut across = vec![NONE; STRIDE * triangles.len()];
-    for (a, list) in (0..index(count)).map(|a| (a, edges_of(a))) {
-        for (i, [b, corner]) in list.iter().enumerate() {
-            if list[..i].iter().any(|[other, _]| other == b) {
-                return Err(PatchError::Edge(a, *b));
-            }
-            if *b > a
-                && let Some([_, twin]) = edges_of(*b).iter().find(|[end, _]| *end == a)
-            {
+    let (mut across, mut repeated) = (vec![NONE; STRIDE * triangles.len()], None);
+    for a in 0..index(count) {
+        for [b, corner] in edges_of(a).iter().filter(|[b, _]| *b > a) {
+            if let Some([_, twin]) = edges_of(*b).iter().find(|[end, _]| *end == a) {
+                if across[*twin as usize] != NONE {
+                    repeated = Some([a, *b]);
+                }
                 across[*corner as usize] = *twin;
                 across[*twin as usize] = *corner;
             }
         }
     }
-    Ok(across)
+    // Of two on the same side of an edge one at least has found nobody.
+    for (four, triangle) in across.as_chunks::<STRIDE>().0.iter().zip(triangles) {
+        for i in (0..3).filter(|i| four[*i] == NONE) {
+            let (a, b) = (triangle[i], triangle[(i + 1) % 3]);
+            if edges_of(a).iter().filter(|[end, _]| *end == b).count() > 1 {
+                repeated = Some([a, b]);
+            }
+        }
+    }
+    (across, repeated)
 }
 
 /// Whether a patch is one.
@@ -177,29 +208,31 @@ fn check(patch: &Patch, points: &[Point], within: &[Within]) -> Result<(), Patch
     Ok(())
 }
 
-/// The fan of each corner, and the place of each fan.
-fn fans(triangles: &[[u32; 3]], across: &[Corner], points: &[Point]) -> (Vec<u32>, Vec<Point>) {
-    let mut fans = vec![NONE; across.len()];
-    let mut places = Vec::with_capacity(points.len());
+/// Gives each fan of a vertex with several gaps around it a place of its own.
+fn separate(triangles: &[[u32; 3]], across: &[Corner], fans: &mut [u32], places: &mut Vec<Point>) {
+    let mut is_met = vec![false; fans.len()];
+    let mut is_first = vec![true; places.len()];
     for (corner, vertex) in corners(triangles.len()).zip(triangles.as_flattened()) {
-        if fans[corner as usize] != NONE {
+        if is_met[corner as usize] {
             continue;
         }
-        let fan = index(places.len());
-        places.push(points[*vertex as usize]);
+        let mut fan = *vertex;
+        if !std::mem::replace(&mut is_first[fan as usize], false) {
+            fan = index(places.len());
+            places.push(places[*vertex as usize]);
+        }
         // To the left around the vertex, and if that does not come back, to the right.
         let mut at = corner;
-        while at != NONE && fans[at as usize] == NONE {
-            fans[at as usize] = fan;
+        while at != NONE && !is_met[at as usize] {
+            (fans[at as usize], is_met[at as usize]) = (fan, true);
             at = across[prev(at) as usize];
         }
         at = right_of(across, corner);
-        while at != NONE && fans[at as usize] == NONE {
-            fans[at as usize] = fan;
+        while at != NONE && !is_met[at as usize] {
+            (fans[at as usize], is_met[at as usize]) = (fan, true);
             at = right_of(across, at);
         }
     }
-    (fans, places)
 }
 
 /// The corner to the right around the same vertex.

@@ -185,6 +185,46 @@ impl Units {
 /// # Errors
 /// When it is no patch of this diamond.
 pub fn encode(forest: &Forest, d: Diamond, patch: &Patch) -> Result<Vec<u8>, PatchError> {
+    encode_with(forest, d, patch, &Neighbours::of(patch))
+}
+
+/// Which triangles of a patch have an edge in common. Takes 16 bytes a triangle.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Neighbours {
+    across: Vec<u32>,
+    /// An edge with two triangles on the same side.
+    repeated: Option<[u32; 2]>,
+}
+
+impl Neighbours {
+    /// Those of a patch. Of what is none the outcome has no meaning but to [`encode_with`], which refuses it.
+    #[must_use]
+    pub fn of(patch: &Patch) -> Self {
+        let (across, repeated) = mesh::across(&patch.triangles, patch.vertices.len());
+        Self { across, repeated }
+    }
+
+    /// Across the edge of triangle t from its corner i to the next one, at 4 t + i: four times the number of the triangle
+    /// there and the corner at which the same edge begins in it; `u32::MAX` if there is none. Every fourth is that.
+    #[must_use]
+    pub fn across(&self) -> &[u32] {
+        &self.across
+    }
+}
+
+/// [`encode`] given the patch's own neighbours.
+///
+/// # Errors
+/// When it is no patch of this diamond.
+///
+/// # Panics
+/// If the neighbours are those of a patch with fewer triangles.
+pub fn encode_with(
+    forest: &Forest,
+    d: Diamond,
+    patch: &Patch,
+    neighbours: &Neighbours,
+) -> Result<Vec<u8>, PatchError> {
     let Some(first) = patch.triangles.first().and_then(|t| patch.vertices.get(t[0] as usize)) else {
         return if patch.triangles.is_empty() {
             Ok(Vec::new())
@@ -225,7 +265,7 @@ pub fn encode(forest: &Forest, d: Diamond, patch: &Patch) -> Result<Vec<u8>, Pat
     };
     let points: Vec<Point> = patch.vertices.iter().map(point).collect();
     let square = Square::new(forest, d, units.shift);
-    let mesh = Mesh::new(patch, &points, &square)?;
+    let mesh = Mesh::new(patch, neighbours, &points, &square)?;
     let holes = mesh.has_holes();
     let expected = patch.triangles.len();
     // Two bits or three a triangle, and three numbers a vertex.
@@ -339,10 +379,10 @@ fn gcd(a: i64, b: i64) -> i64 {
     a
 }
 
-struct Sender {
+struct Sender<'a> {
     coder: Encoder,
     tables: &'static Tables,
-    mesh: Mesh,
+    mesh: Mesh<'a>,
 }
 
 /// Of numbers in the lane; bits are in the first.
@@ -351,7 +391,7 @@ struct Receiver<'a, const LANE: usize> {
     tables: &'static Tables,
 }
 
-impl Pass for Sender {
+impl Pass for Sender<'_> {
     #[inline]
     fn bit(&mut self, context: &mut Context, bit: bool) -> bool {
         self.coder.bit(context, bit);

@@ -139,6 +139,7 @@ fn table(class: usize) -> Table {
 }
 
 /// Appends a number of magnitude below 2^30.
+#[inline]
 pub(super) fn encode(coder: &mut Encoder, lane: u8, tables: &Tables, scale: &mut Scale, number: i64) {
     let (class, low) = scale.table();
     let table = &tables[class];
@@ -153,7 +154,10 @@ pub(super) fn encode(coder: &mut Encoder, lane: u8, tables: &Tables, scale: &mut
         coder.plain(lane, bits as u16, 5);
         plain(coder, lane, beyond - (1 << bits), bits);
     }
-    plain(coder, lane, (number - (high << low)) as u32, low);
+    // Most numbers have no such bits.
+    if low > 0 {
+        plain(coder, lane, (number - (high << low)) as u32, low);
+    }
     scale.learn(number);
 }
 
