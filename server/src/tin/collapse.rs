@@ -75,6 +75,8 @@ pub(super) struct Before<'a> {
     pub(super) needs: &'a [u16],
     /// Whether it is the mesh of the source, with nothing gone yet.
     pub(super) is_source: bool,
+    /// Which vertices are as they are in the source's mesh; none if nothing is known.
+    pub(super) untouched: &'a [bool],
 }
 
 /// A mesh being simplified.
@@ -98,6 +100,7 @@ pub(super) struct Simplifier<'a> {
     /// As [`Before`] says.
     needs: &'a [u16],
     is_source: bool,
+    untouched: &'a [bool],
     /// Of triangles of the star, if its centre goes the way that was looked at last.
     found: Vec<(usize, f32)>,
     star: Star,
@@ -129,9 +132,10 @@ impl<'a> Simplifier<'a> {
             errors: before.errors,
             needs: before.needs,
             is_source: before.is_source,
+            untouched: before.untouched,
             found: Vec::new(),
             star: Star::default(),
-            fan: Fan::default(),
+            fan: Fan::new(square.width()),
             ways: Vec::new(),
         }
     }
@@ -203,8 +207,13 @@ impl<'a> Simplifier<'a> {
         let mut needs = Vec::with_capacity(self.states.len());
         for v in 0..index(self.states.len()) {
             if self.states[v as usize].needed == 0.0 {
-                self.mesh.look(v, &mut self.star);
-                self.bound();
+                let untouched = self.untouched.get(v as usize).is_some_and(|is| *is);
+                if untouched && !self.mesh.is_at_border(v) {
+                    self.bound_in_lattice(v);
+                } else {
+                    self.mesh.look(v, &mut self.star);
+                    self.bound();
+                }
             }
             needs.extend(Some(self.states[v as usize].needed).filter(|needed| *needed < f32::INFINITY));
         }
@@ -227,8 +236,31 @@ impl<'a> Simplifier<'a> {
         }
         self.fan.look(&self.mesh, &self.star);
         let along = self.states[v as usize].role == Role::Along;
-        let off = self.fan.least_off(|to| !along || self.is_along(self.star.rim[to]));
+        let (square, points, rim) = (&self.square, &self.mesh.points, &self.star.rim);
+        let off = self.fan.least_off(|to| !along || square.is_along(points[rim[to] as usize]));
         self.states[v as usize].needed = below(off).max(0.0);
+    }
+
+    /// [`Simplifier::bound`] of a vertex that no border and nothing but what the source's mesh has is around: it ends up halfway between two opposite
+    /// neighbours.
+    fn bound_in_lattice(&mut self, v: u32) {
+        const AXES: [[i32; 2]; 4] = [[1, 0], [0, 1], [1, 1], [-1, 1]];
+        let (Until::Error { ground, .. } | Until::Within { ground, .. }) = self.until else { return };
+        let (at, along) = (self.mesh.points[v as usize], self.states[v as usize].role == Role::Along);
+        // Diagonals meet in every second vertex.
+        let axes = if (at.x + at.y).is_multiple_of(2) { &AXES[..] } else { &AXES[..2] };
+        let mut least = f64::INFINITY;
+        for [x, y] in axes {
+            let (here, there) = (
+                Vertex { x: at.x.wrapping_add_signed(*x), y: at.y.wrapping_add_signed(*y), height: 0 },
+                Vertex { x: at.x.wrapping_add_signed(-*x), y: at.y.wrapping_add_signed(-*y), height: 0 },
+            );
+            if !along || self.square.is_along(here) {
+                let bend = ground.at(here.x, here.y) + ground.at(there.x, there.y) - 2 * at.height;
+                least = least.min(0.5 * f64::from(bend.abs()));
+            }
+        }
+        self.states[v as usize].needed = below(least).max(0.0);
     }
 
     /// Whether the vertex has a sample that is to be kept.
@@ -244,15 +276,16 @@ impl<'a> Simplifier<'a> {
     /// What a vertex needs at least as long as nothing changes around it, shortened; 0 if that is not known, or may change
     /// with what the diamond becomes a part of.
     pub(super) fn known(&self) -> Vec<u16> {
-        let mut known = vec![0; self.mesh.points.len()];
-        for h in self.mesh.borders() {
-            known[self.mesh.origin(h) as usize] = u16::MAX;
-        }
-        for (known, state) in known.iter_mut().zip(&self.states) {
-            let holds = *known == 0 && state.role == Role::Free && state.needed < f32::INFINITY;
-            *known = if holds { shortened(state.needed) } else { 0 };
-        }
-        known
+        let known = |(v, state): (u32, &State)| {
+            let may = state.role == Role::Free && state.needed < f32::INFINITY;
+            if may && !self.mesh.is_at_border(v) { shortened(state.needed) } else { 0 }
+        };
+        (0..).zip(&self.states).map(known).collect()
+    }
+
+    /// Which vertices have had nothing gone around them.
+    pub(super) fn untouched(&self) -> Vec<bool> {
+        self.states.iter().map(|state| !state.is_touched).collect()
     }
 
     /// Collapses what a limit allows, the least important first. What changes after it was tried is tried again in
@@ -400,6 +433,7 @@ impl<'a> Simplifier<'a> {
         }
         let mut needed = f64::INFINITY;
         self.fan.look(mesh, star);
+        self.fan.measure();
         // Opposite ways out of four leave the same two triangles.
         let ways = if star.rim.len() == 4 && !star.border && !along { 2 } else { star.rim.len() };
         for to in 0..ways {
@@ -410,7 +444,8 @@ impl<'a> Simplifier<'a> {
             if along && !self.is_along(star.rim[to]) {
                 continue;
             }
-            let Some(off) = self.fan.off(to) else { continue };
+            let matters = |off| off <= limit || off < needed;
+            let Some(off) = self.fan.off(to, matters) else { continue };
             if off > limit {
                 needed = needed.min(off);
             } else {
@@ -429,7 +464,7 @@ impl<'a> Simplifier<'a> {
 
     /// Whether a vertex beside one on the hypotenuse lies on it, too.
     fn is_along(&self, v: u32) -> bool {
-        turn(self.square.a, self.square.b, self.mesh.points[v as usize]) == 0
+        self.square.is_along(self.mesh.points[v as usize])
     }
 
     /// How far samples will be from the triangles if the star's centre goes that way, in quanta; or, where that is more
@@ -507,6 +542,7 @@ impl<'a> Simplifier<'a> {
         self.states[star.centre as usize].needed = f32::INFINITY;
         for v in &star.rim {
             let state = &mut self.states[*v as usize];
+            state.is_touched = true;
             if state.role != Role::Locked {
                 (state.needed, state.is_known) = (0.0, false);
             }

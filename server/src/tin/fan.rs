@@ -10,23 +10,45 @@
 //! the three terms are barycentric coordinates of the origin, how far the vertex's own sample will be from the surface.
 //! Most ways that an error forbids are forbidden by that sample, before any other is looked at.
 
+use super::Scale;
 use super::mesh::{Mesh, Star};
 use super::metric::{Vector, length};
-use super::{Scale, Vertex};
 
 /// A vertex around: along x and y in cells, and in height in quanta.
 type Step = [f64; 3];
 
+/// Vertices around of most fans, at most.
+const FEW: usize = 8;
+
+/// Cells that a mesh may be wide for all areas of its fans to be exact in `f32`: sums of three products of two steps
+/// are below 2^24.
+const NEAR: u32 = (1 << 11) - 1;
+
 /// The vertices around another one, counterclockwise.
 #[derive(Debug, Default)]
 pub(super) struct Fan {
-    /// Around a whole fan, all twice: so that those after any one follow one another.
+    /// Around a whole fan that is not [`Few`], all twice: so that those after any one follow one another.
     steps: Vec<Step>,
-    /// For each triangle that follows a vertex, twice its area in plan; likewise.
+    /// For each triangle that follows a vertex, twice its area in plan; likewise. None if the fan is [`Few`].
     turns: Vec<f64>,
+    few: Few,
+    is_few: bool,
+    is_near: bool,
     /// Vertices around, each once.
     count: usize,
     border: bool,
+}
+
+/// A whole fan of few vertices nearby, as most are: numbers that are worked on side by side. Behind those of the vertices
+/// comes the first one again and again.
+#[derive(Debug, Default)]
+struct Few {
+    x: [f32; FEW + 1],
+    y: [f32; FEW + 1],
+    /// For each triangle that follows a vertex, twice its area in plan.
+    turns: [f32; FEW],
+    /// How far the centre's own sample will be from the surface, by ways, if they can be gone.
+    offs: [f64; FEW],
 }
 
 /// Twice the area of a triangle of the origin, in plan.
@@ -34,18 +56,74 @@ fn turn(a: Step, b: Step) -> f64 {
     a[0] * b[1] - a[1] * b[0]
 }
 
+impl Few {
+    #[allow(clippy::cast_possible_truncation, reason = "small whole numbers")]
+    fn look(&mut self, steps: &[Step]) {
+        (self.x, self.y) = ([steps[0][0] as f32; FEW + 1], [steps[0][1] as f32; FEW + 1]);
+        for ((x, y), step) in self.x.iter_mut().zip(&mut self.y).zip(steps) {
+            (*x, *y) = (step[0] as f32, step[1] as f32);
+        }
+        let (x, y) = (&self.x, &self.y);
+        self.turns = std::array::from_fn(|i| x[i] * y[i + 1] - y[i] * x[i + 1]);
+    }
+
+    /// Finds out how far off the centre's own sample will be. The triangle that will cover it lies opposite of the way: it
+    /// turns on with the ways, so all are found in one round.
+    fn measure(&mut self, steps: &[Step]) {
+        let mut at = 1;
+        for (to, u) in steps.iter().enumerate() {
+            let (u_x, u_y) = (self.x[to % FEW], self.y[to % FEW]);
+            let turn = |i: usize| u_x * self.y[i % FEW] - u_y * self.x[i % FEW];
+            let mut here = turn(at);
+            for _ in steps {
+                let after = if at + 1 == steps.len() { 0 } else { at + 1 };
+                let there = turn(after);
+                if there <= 0.0 {
+                    let between = f64::from(self.turns[at % FEW]);
+                    let (here, there) = (f64::from(here), f64::from(there));
+                    // All are whole numbers, exact below 2^53.
+                    let height = between * u[2] + here * steps[after][2] - there * steps[at][2];
+                    self.offs[to % FEW] = height.abs() / (between + here - there);
+                    break;
+                }
+                (at, here) = (after, there);
+            }
+        }
+    }
+
+    /// Whether a triangle would turn over if the centre slid into the vertex `to` of so many.
+    fn turns_over(&self, to: usize, count: usize) -> bool {
+        let Self { x, y, turns, .. } = self;
+        let (u_x, u_y) = (x[to % FEW], y[to % FEW]);
+        let turn = |i: usize| u_x * y[i] - u_y * x[i];
+        let doubled: [f32; FEW] = std::array::from_fn(|i| turns[i] + turn(i) - turn(i + 1));
+        // The two triangles at the way itself have no area left, and neither have those behind all.
+        let without: usize = doubled.map(|doubled| u32::from(doubled <= 0.0)).iter().sum::<u32>() as usize;
+        without > 2 + FEW - count
+    }
+}
+
 impl Fan {
+    /// Of a mesh so many cells wide.
+    pub(super) fn new(width: u32) -> Self {
+        Self { is_near: width <= NEAR, ..Self::default() }
+    }
+
     /// Takes over a star.
     pub(super) fn look(&mut self, mesh: &Mesh, star: &Star) {
         let centre = mesh.points[star.centre as usize];
         let step = |a: u32, b: u32| f64::from(b.wrapping_sub(a).cast_signed());
-        let seen = |v: &u32| {
-            let v: Vertex = mesh.points[*v as usize];
-            [step(centre.x, v.x), step(centre.y, v.y), f64::from(v.height - centre.height)]
-        };
         self.steps.clear();
-        self.steps.extend(star.rim.iter().map(seen));
+        self.steps.resize(star.rim.len(), Step::default());
+        for (seen, v) in self.steps.iter_mut().zip(&star.rim) {
+            let v = &mesh.points[*v as usize];
+            *seen = [step(centre.x, v.x), step(centre.y, v.y), f64::from(v.height - centre.height)];
+        }
         (self.count, self.border) = (self.steps.len(), star.border);
+        self.is_few = self.is_near && !self.border && self.count <= FEW;
+        if self.is_few {
+            return self.few.look(&self.steps);
+        }
         self.turns.clear();
         self.turns.extend(self.steps.windows(2).map(|pair| turn(pair[0], pair[1])));
         if !self.border {
@@ -53,6 +131,13 @@ impl Fan {
             self.steps.extend_from_within(..);
             self.turns.push(last);
             self.turns.extend_from_within(..self.count - 1);
+        }
+    }
+
+    /// Prepares [`Fan::off`].
+    pub(super) fn measure(&mut self) {
+        if self.is_few {
+            self.few.measure(&self.steps);
         }
     }
 
@@ -67,8 +152,17 @@ impl Fan {
     }
 
     /// How far the centre's own sample will be from the surface, in quanta, if the centre slides into the vertex
-    /// `to`; `None` if a triangle would turn over.
-    pub(super) fn off(&self, to: usize) -> Option<f64> {
+    /// `to`; `None` if a triangle would turn over, or if that does not matter so far off.
+    pub(super) fn off(&self, to: usize, matters: impl Fn(f64) -> bool) -> Option<f64> {
+        if self.is_few {
+            let off = self.few.offs[to % FEW];
+            return (matters(off) && !self.few.turns_over(to, self.count)).then_some(off);
+        }
+        self.off_of_any(to).filter(|off| matters(*off))
+    }
+
+    /// [`Fan::off`] of a fan that is not [`Few`].
+    fn off_of_any(&self, to: usize) -> Option<f64> {
         let u = self.steps[to];
         let rest = self.rest(to);
         let steps = &self.steps[rest.clone()];
@@ -93,19 +187,27 @@ impl Fan {
 
     /// How far the centre's own sample will be from the surface at least, whichever way the centre goes of those that
     /// `may` be gone; infinite if there is none.
-    pub(super) fn least_off(&self, may: impl Fn(usize) -> bool) -> f64 {
+    pub(super) fn least_off(&mut self, may: impl Fn(usize) -> bool) -> f64 {
         let half = self.count / 2;
         let opposite = |i: usize| {
             let (here, there) = (self.steps[i], self.steps[i + half]);
             here[0] == -there[0] && here[1] == -there[1]
         };
-        let ways = (0..self.count).filter(|to| may(*to));
         if !self.border && self.count.is_multiple_of(2) && (0..half).all(opposite) {
             // As in a lattice: what is opposite of a vertex is another one, and the centre halfway between them.
-            let bend = |to: usize| self.steps[to][2] + self.steps[(to + half) % self.count][2];
+            let bend = |to: usize| {
+                let across = if to < half { to + half } else { to - half };
+                self.steps[to][2] + self.steps[across][2]
+            };
+            let ways = (0..self.count).filter(|to| may(*to));
             return ways.map(|to| 0.5 * bend(to).abs()).fold(f64::INFINITY, f64::min);
         }
-        ways.filter_map(|to| self.off(to)).fold(f64::INFINITY, f64::min)
+        self.measure();
+        let mut least = f64::INFINITY;
+        for to in (0..self.count).filter(|to| may(*to)) {
+            least = self.off(to, |off| off < least).unwrap_or(least);
+        }
+        least
     }
 
     /// How much the normals of the triangles that survive change: the sum of (A + A')/2 (1 - n . n') over them, given
@@ -123,16 +225,19 @@ impl Fan {
             ]
         };
         let rest = self.rest(to);
+        let around = |i: usize| if i < self.count { i } else { i - self.count };
         let mut sum = 0.0;
-        let mut here = with(self.steps[rest.start]);
-        for i in rest.start..rest.end - 1 {
-            let there = with(self.steps[i + 1]);
-            let (old, area) = now(if i < self.count { i } else { i - self.count });
+        let mut at = around(rest.start);
+        let mut here = with(self.steps[at]);
+        for _ in rest.start..rest.end - 1 {
+            let after = around(at + 1);
+            let there = with(self.steps[after]);
+            let (old, area) = now(at);
             let new: Vector = std::array::from_fn(|k| old[k] + here[k] - there[k]);
             let area_new = length(new);
             let dot = old[0] * new[0] + old[1] * new[1] + old[2] * new[2];
             sum += 0.5 * (area + area_new) * (1.0 - dot / (area * area_new));
-            here = there;
+            (at, here) = (after, there);
         }
         sum
     }
@@ -140,6 +245,7 @@ impl Fan {
 
 #[cfg(test)]
 mod tests {
+    use super::super::Vertex;
     use super::super::ground::Ground;
     use super::*;
     use proptest::prelude::*;
@@ -163,9 +269,10 @@ mod tests {
             let points: Vec<Vertex> = std::iter::once(centre).chain(around).collect();
             let triangles: Vec<[u32; 3]> = (1..8 + u32::from(whole)).map(|i| [0, i, i % 8 + 1]).collect();
             let mesh = Mesh::new(&points, &triangles);
-            let (mut star, mut fan) = (Star::default(), Fan::default());
+            let (mut star, mut fan) = (Star::default(), Fan::new(if whole { 20 } else { NEAR + 1 }));
             mesh.look(0, &mut star);
             fan.look(&mesh, &star);
+            fan.measure();
             let mut heights = vec![diamantina_protocol::NODATA; 21 * 21];
             heights[10 * 21 + 10] = height;
             let ground = Ground { origin: [0, 0], width: 21, heights: &heights };
@@ -179,7 +286,7 @@ mod tests {
                 let rest = (0..star.spokes.len()).map(|i| star.edge(i)).filter(|edge| !edge.contains(&u));
                 let rest: Vec<[Vertex; 3]> = rest.map(|[p, q]| [point(u), point(p), point(q)]).collect();
                 let turns_over = rest.iter().any(|[a, b, c]| super::super::metric::turn(*a, *b, *c) <= 0);
-                let off = fan.off(to);
+                let off = fan.off(to, |_| true);
                 prop_assert_eq!(off.is_none(), turns_over);
                 turns |= turns_over;
                 least = least.min(off.unwrap_or(f64::INFINITY));

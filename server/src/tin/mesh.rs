@@ -51,7 +51,8 @@ impl Half {
     const NO: Self = Self { origin: NONE, twin: NONE };
 }
 
-/// Triangles with their neighbours. Takes 32 bytes a triangle, 20 while it is made, and 16 a vertex.
+/// Triangles with their neighbours. Takes 32 bytes a triangle, 40 more while it is made if its twins are not known, and 16
+/// a vertex.
 #[derive(Debug, Default)]
 pub(super) struct Mesh {
     halves: Vec<Half>,
@@ -104,79 +105,52 @@ impl Star {
 impl Mesh {
     /// The mesh of some triangles, counterclockwise in plan, no two of which overlap.
     pub(super) fn new(points: &[Vertex], triangles: &[[u32; 3]]) -> Self {
-        let half = |origin: u32| Half { origin, twin: NONE };
-        let four = |[a, b, c]: &[u32; 3]| [half(*a), half(*b), half(*c), Half::NO];
+        Self::with_twins(points, triangles, &twins(points.len(), triangles))
+    }
+
+    /// [`Mesh::new`] given the twin of each half-edge.
+    pub(super) fn with_twins(points: &[Vertex], triangles: &[[u32; 3]], twins: &[u32]) -> Self {
         let mut mesh = Self {
-            halves: triangles.iter().flat_map(four).collect(),
+            halves: Vec::with_capacity(STRIDE * triangles.len()),
             first: vec![NONE; points.len()],
             points: points.to_vec(),
             live: triangles.len(),
         };
-        let (list, starts) = mesh.pair(triangles);
-        mesh.separate(&list, &starts);
+        for (h, ([a, b, c], [ab, bc, ca, _])) in
+            (0..).step_by(STRIDE).zip(triangles.iter().zip(twins.as_chunks::<STRIDE>().0))
+        {
+            let half = |origin: &u32, twin: &u32| Half { origin: *origin, twin: *twin };
+            mesh.halves.extend_from_slice(&[half(a, ab), half(b, bc), half(c, ca), Half::NO]);
+            for (h, v) in (h..).zip([a, b, c]) {
+                let first = &mut mesh.first[*v as usize];
+                *first = (*first).min(h);
+            }
+        }
+        mesh.separate();
         mesh
     }
 
-    /// Finds the twins; the half-edges that leave each vertex, with what they lead to, and the position of its first.
-    fn pair(&mut self, triangles: &[[u32; 3]]) -> (Vec<[u32; 2]>, Vec<u32>) {
-        // One place too far to begin with: filling the list moves each to where it belongs.
-        let mut starts = vec![0u32; self.points.len() + 2];
-        for v in triangles.as_flattened() {
-            starts[*v as usize + 2] += 1;
-        }
-        let mut sum = 0;
-        for start in &mut starts {
-            sum += *start;
-            *start = sum;
-        }
-        let mut list = vec![[0u32; 2]; 3 * triangles.len()];
-        for (t, [a, b, c]) in (0..).step_by(STRIDE).zip(triangles) {
-            for (h, from, to) in [(t, a, b), (t + 1, b, c), (t + 2, c, a)] {
-                let at = &mut starts[*from as usize + 1];
-                list[*at as usize] = [h, *to];
-                *at += 1;
-            }
-        }
-        for v in 0..self.points.len() {
-            let from = index(v);
-            for [h, to] in &list[starts[v] as usize..starts[v + 1] as usize] {
-                // Each edge once, from its lower end.
-                if *to < from {
-                    continue;
-                }
-                let leaving = &list[starts[*to as usize] as usize..starts[*to as usize + 1] as usize];
-                if let Some([twin, _]) = leaving.iter().find(|[_, back]| *back == from) {
-                    self.halves[*h as usize].twin = *twin;
-                    self.halves[*twin as usize].twin = *h;
-                }
-            }
-        }
-        (list, starts)
-    }
-
     /// Gives each fan of triangles around a point a vertex of its own.
-    fn separate(&mut self, list: &[[u32; 2]], starts: &[u32]) {
-        for v in 0..self.first.len() {
-            let leaving = &list[starts[v] as usize..starts[v + 1] as usize];
-            let Some([any, _]) = leaving.first() else { continue };
-            self.first[v] = *any;
-            let mut is_first = true;
-            for [fan, _] in leaving {
-                if self.twin(*fan) != NONE {
-                    continue;
-                }
-                if std::mem::replace(&mut is_first, false) {
-                    self.first[v] = *fan;
-                    continue;
-                }
-                let copy = index(self.points.len());
-                self.points.push(self.points[v]);
-                self.first.push(*fan);
-                let mut h = *fan;
-                while h != NONE {
-                    self.halves[h as usize].origin = copy;
-                    h = self.twin(prev(h));
-                }
+    fn separate(&mut self) {
+        let mut others = Vec::new();
+        for (h, half) in (0..).zip(&self.halves).filter(|(_, half)| half.twin == NONE && half.origin != NONE)
+        {
+            let first = &mut self.first[half.origin as usize];
+            if *first != h && self.halves[*first as usize].twin == NONE {
+                others.push((half.origin, h));
+            } else {
+                *first = h;
+            }
+        }
+        others.sort_unstable();
+        for (v, fan) in others {
+            let copy = index(self.points.len());
+            self.points.push(self.points[v as usize]);
+            self.first.push(fan);
+            let mut h = fan;
+            while h != NONE {
+                self.halves[h as usize].origin = copy;
+                h = self.twin(prev(h));
             }
         }
     }
@@ -201,6 +175,11 @@ impl Mesh {
         self.first[v as usize] != NONE
     }
 
+    /// Whether a vertex that is live lies at a border.
+    pub(super) fn is_at_border(&self, v: u32) -> bool {
+        self.twin(self.first[v as usize]) == NONE
+    }
+
     /// The triangles that have not vanished: their numbers and corners.
     pub(super) fn triangles(&self) -> impl Iterator<Item = (usize, [u32; 3])> {
         let fours = self.halves.as_chunks::<STRIDE>().0.iter().enumerate();
@@ -223,22 +202,25 @@ impl Mesh {
         star.spokes.clear();
         star.rim.clear();
         star.centre = v;
+        let fours = self.halves.as_chunks::<STRIDE>().0;
         let start = self.first[v as usize];
-        star.border = self.twin(start) == NONE;
         let mut h = start;
-        loop {
+        star.border = loop {
+            let four = &fours[triangle(h)];
+            // Of corner 0, 1 and 2 two bits each: the corners after and before.
+            let twice = 2 * (h & 3);
+            let (to, from) = (four[0b00_10_01 >> twice & 3], four[0b01_00_10 >> twice & 3]);
             star.spokes.push(h);
-            star.rim.push(self.target(h));
-            let into = prev(h);
-            h = self.twin(into);
+            star.rim.push(to.origin);
+            h = from.twin;
             if h == NONE {
-                star.rim.push(self.origin(into));
-                break;
+                star.rim.push(from.origin);
+                break true;
             }
             if h == start {
-                break;
+                break false;
             }
-        }
+        };
     }
 
     fn link(&mut self, h: u32, twin: u32) {
@@ -328,6 +310,41 @@ impl Mesh {
         }
         moved
     }
+}
+
+/// The twin of each half-edge of some triangles of so many vertices.
+fn twins(count: usize, triangles: &[[u32; 3]]) -> Vec<u32> {
+    // The half-edges that leave each vertex, with what they lead to, and the position of its first. One place too far to
+    // begin with: filling the list moves each to where it belongs.
+    let mut starts = vec![0u32; count + 2];
+    for v in triangles.as_flattened() {
+        starts[*v as usize + 2] += 1;
+    }
+    let mut sum = 0;
+    for start in &mut starts {
+        sum += *start;
+        *start = sum;
+    }
+    let mut list = vec![[0u32; 2]; 3 * triangles.len()];
+    for (t, [a, b, c]) in (0..).step_by(STRIDE).zip(triangles) {
+        for (h, from, to) in [(t, a, b), (t + 1, b, c), (t + 2, c, a)] {
+            let at = &mut starts[*from as usize + 1];
+            list[*at as usize] = [h, *to];
+            *at += 1;
+        }
+    }
+    let leaving = |v: u32| &list[starts[v as usize] as usize..starts[v as usize + 1] as usize];
+    let mut twins = vec![NONE; STRIDE * triangles.len()];
+    for from in 0..index(count) {
+        // Each edge once, from its lower end.
+        for [h, to] in leaving(from).iter().filter(|[_, to]| *to > from) {
+            if let Some([twin, _]) = leaving(*to).iter().find(|[_, back]| *back == from) {
+                twins[*h as usize] = *twin;
+                twins[*twin as usize] = *h;
+            }
+        }
+    }
+    twins
 }
 
 fn index(count: usize) -> u32 {

@@ -101,8 +101,8 @@ impl Costs {
     pub(super) fn new(mesh: &Mesh, metric: Metric, lambda: f64, scale: Scale) -> Self {
         let corner = |v: u32| mesh.points[v as usize];
         // A mesh that is new has all its triangles.
-        let vectors =
-            mesh.triangles().map(|(_, t)| with_length(area_vector(&scale, t.map(corner)))).collect();
+        let mut vectors = Vec::with_capacity(mesh.live);
+        vectors.extend(mesh.triangles().map(|(_, t)| with_length(area_vector(&scale, t.map(corner)))));
         let origin = mesh.points.first().copied().unwrap_or_default();
         let mut costs = Self { scale, lambda, vectors, quadrics: Vec::new(), origin };
         if metric == Metric::Quadric {

@@ -2,15 +2,15 @@
 
 use super::collapse::{Before, Passed, Simplifier, Until, distance_to};
 use super::ground::Ground;
-use super::mesh::{Mesh, NONE, triangle};
-use super::metric::{between, length, turn};
-use super::square::Square;
+use super::mesh::{Mesh, NONE, Star, triangle};
+use super::metric::{Costs, between, length, turn};
+use super::square::{Role, Square};
 use super::state::at_least;
-use super::{Rules, Vertex};
+use super::{Metric, Rules, Vertex};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
-use diamantina_protocol::tin::Patch;
+use diamantina_protocol::tin::{Neighbours, Patch, PatchError, encode_with};
 use std::collections::{HashMap, HashSet};
 
 /// An edge of the border, from vertex to vertex, and the points of the source's border that it stands for, but for those
@@ -33,6 +33,8 @@ pub struct Tin {
     pub needs: Vec<u16>,
     /// How far what was left out since there was no room for it lies from what is there, in metres.
     pub lost: f64,
+    /// Which vertices have all triangles that they have in the source's own mesh; none if that is not known.
+    pub untouched: Vec<bool>,
 }
 
 /// The meshes of a diamond's four triangles as one.
@@ -50,6 +52,23 @@ pub struct Merged {
     pub lost: f64,
     /// Whether it is the source's own mesh.
     is_source: bool,
+    /// See [`Tin::untouched`]; of each vertex.
+    untouched: Vec<bool>,
+    /// Those of the patch, if they are known.
+    neighbours: Option<Neighbours>,
+}
+
+impl Merged {
+    /// The payload of the diamond. What neighbours the patch has is known from then on.
+    ///
+    /// # Errors
+    /// When it is no patch of this diamond.
+    pub fn encode(&mut self, forest: &Forest, d: Diamond) -> Result<Vec<u8>, PatchError> {
+        let neighbours = Neighbours::of(&self.patch);
+        let bytes = encode_with(forest, d, &self.patch, &neighbours)?;
+        self.neighbours = Some(neighbours);
+        Ok(bytes)
+    }
 }
 
 /// What became of a diamond.
@@ -84,6 +103,12 @@ pub fn half_of(forest: &Forest, child: Diamond, parent: Diamond) -> usize {
     usize::from([lower.x, lower.y] != parent.centre())
 }
 
+/// The two micro-triangles of a cell of the lattice, given its south-west corner.
+fn halves_of_cell(x: u32, y: u32) -> [[[u32; 2]; 3]; 2] {
+    let [sw, se, ne, nw] = [[x, y], [x + 1, y], [x + 1, y + 1], [x, y + 1]];
+    if (x + y).is_multiple_of(2) { [[sw, se, ne], [sw, ne, nw]] } else { [[sw, se, nw], [se, ne, nw]] }
+}
+
 /// The source's own mesh of a diamond's square: all micro-triangles of the lattice whose corners have heights. For
 /// diamonds of an even level, and of an odd one at least two cells across.
 #[must_use]
@@ -94,6 +119,10 @@ pub fn source(forest: &Forest, d: Diamond, ground: Ground<'_>) -> Merged {
     let columns = (high[0] - low[0] + 1) as usize;
     let mut numbers = vec![NONE; columns * (high[1] - low[1] + 1) as usize];
     let mut merged = Merged { is_source: true, ..Merged::default() };
+    // Of an odd level's box half.
+    let cells = (columns - 1) * (high[1] - low[1]) as usize;
+    merged.patch.triangles.reserve(if even { 2 * cells } else { cells });
+    merged.patch.vertices.reserve(if even { numbers.len() } else { numbers.len() * 5 / 8 });
     let inside = |corners: [[u32; 2]; 3]| {
         // The sum of the three corners, against three times each side.
         let (x, y) = (corners.iter().map(|c| c[0]).sum(), corners.iter().map(|c| c[1]).sum());
@@ -103,13 +132,7 @@ pub fn source(forest: &Forest, d: Diamond, ground: Ground<'_>) -> Merged {
     };
     for y in low[1]..high[1] {
         for x in low[0]..high[0] {
-            let [sw, se, ne, nw] = [[x, y], [x + 1, y], [x + 1, y + 1], [x, y + 1]];
-            let halves = if (x + y).is_multiple_of(2) {
-                [[sw, se, ne], [sw, ne, nw]]
-            } else {
-                [[sw, se, nw], [se, ne, nw]]
-            };
-            for corners in halves {
+            for corners in halves_of_cell(x, y) {
                 let heights = corners.map(|[x, y]| ground.at(x, y));
                 if heights.contains(&NODATA) || !(even || inside(corners)) {
                     continue;
@@ -150,8 +173,12 @@ pub fn merge(forest: &Forest, d: Diamond, tins: [&Tin; 4]) -> Merged {
                 // Two lines through the centre part the four.
                 let is_shared = turn(square.a, centre, *v) == 0 || turn(square.lower, centre, *v) == 0;
                 let number = if is_shared { *shared.entry([v.x, v.y]).or_insert(next) } else { next };
-                if number == next {
+                let untouched = tin.untouched.get(i).copied().unwrap_or(false);
+                if number != next {
+                    merged.untouched[number as usize] &= untouched;
+                } else {
                     merged.patch.vertices.push(*v);
+                    merged.untouched.push(untouched);
                     // What lies on a side has other triangles around it now.
                     merged.needs.push(tin.needs.get(i).copied().filter(|_| !is_shared).unwrap_or(0));
                 }
@@ -180,22 +207,18 @@ pub fn simplify(forest: &Forest, d: Diamond, merged: &Merged, rules: &Rules, unt
         return Simplified::default();
     }
     let square = square(forest, d);
-    let mesh = Mesh::new(&merged.patch.vertices, &merged.patch.triangles);
-    let passed = find_passed(&mesh, merged);
-    let before =
-        Before { errors: find_errors(merged, &until), needs: &merged.needs, is_source: merged.is_source };
-    let mut simplifier = Simplifier::new(mesh, passed, before, square, rules, until);
-    simplifier.run();
-    let needs = if simplifier.errors.is_empty() { Vec::new() } else { simplifier.known() };
-    let Simplifier { mesh, passed, errors, .. } = simplifier;
-    let point = |v: u32| mesh.points[v as usize];
-    let distance = |(h, points): (&u32, &Vec<[u32; 2]>)| {
-        let ends = [point(mesh.origin(*h)), point(mesh.target(*h))];
-        points.iter().map(|p| distance_to(&rules.scale, *p, ends)).fold(0.0, f64::max)
+    let mut simplified = if stays(merged, &square, rules, &until) {
+        // Nothing is lost, and nothing is known of what any vertex needs.
+        let count = merged.patch.vertices.len();
+        let (needs, untouched) = (vec![0; count], vec![true; count]);
+        let told = Told { errors: &merged.errors, needs: &needs, untouched: &untouched };
+        let triangles = merged.patch.triangles.iter().copied().enumerate();
+        let live = merged.patch.triangles.len();
+        let (halves, _) = cut(&merged.patch.vertices, live, triangles, &told, &square);
+        Simplified { halves, apart: merged.lost, vertical: Some(0.0) }
+    } else {
+        collapsed(merged, square, rules, until)
     };
-    let apart = passed.iter().map(distance).fold(0.0, f64::max) + merged.lost;
-    let mut simplified =
-        Simplified { halves: cut(&mesh, passed, &errors, &needs, &square), apart, vertical: None };
     for half in &mut simplified.halves {
         half.lost = merged.lost;
         if half.triangles.len() > rules.triangles_max || half.vertices.len() > rules.vertices_max {
@@ -205,11 +228,87 @@ pub fn simplify(forest: &Forest, d: Diamond, merged: &Merged, rules: &Rules, unt
             simplified.apart = simplified.apart.max(half.lost);
         }
     }
-    if !errors.is_empty() {
+    if let Some(vertical) = &mut simplified.vertical {
         let all = simplified.halves.iter().flat_map(|half| &half.errors);
-        simplified.vertical = Some(all.copied().fold(0.0, f32::max).into());
+        *vertical = all.copied().fold(0.0, f32::max).into();
     }
     simplified
+}
+
+/// Simplifies a mesh that has triangles, and cuts it along the hypotenuse. How far it is from the samples is left to be seen.
+fn collapsed(merged: &Merged, square: Square, rules: &Rules, until: Until<'_>) -> Simplified {
+    let patch = &merged.patch;
+    let mesh = match &merged.neighbours {
+        Some(neighbours) => Mesh::with_twins(&patch.vertices, &patch.triangles, neighbours.across()),
+        None => Mesh::new(&patch.vertices, &patch.triangles),
+    };
+    let passed = find_passed(&mesh, merged);
+    let before = Before {
+        errors: find_errors(merged, &until),
+        needs: &merged.needs,
+        untouched: &merged.untouched,
+        is_source: merged.is_source,
+    };
+    let mut simplifier = Simplifier::new(mesh, passed, before, square, rules, until);
+    simplifier.run();
+    let needs = if simplifier.errors.is_empty() { Vec::new() } else { simplifier.known() };
+    let untouched = if merged.is_source { simplifier.untouched() } else { Vec::new() };
+    let Simplifier { mesh, mut passed, errors, .. } = simplifier;
+    let point = |v: u32| mesh.points[v as usize];
+    let distance = |(h, points): (&u32, &Vec<[u32; 2]>)| {
+        let ends = [point(mesh.origin(*h)), point(mesh.target(*h))];
+        points.iter().map(|p| distance_to(&rules.scale, *p, ends)).fold(0.0, f64::max)
+    };
+    let apart = passed.iter().map(distance).fold(0.0, f64::max) + merged.lost;
+    let told = Told { errors: &errors, needs: &needs, untouched: &untouched };
+    let (mut halves, numbers) = cut(&mesh.points, mesh.live, mesh.triangles(), &told, &square);
+    if !passed.is_empty() {
+        let is_above = |v: &u32| turn(square.a, square.b, point(*v)) > 0;
+        for h in mesh.borders() {
+            if let Some(points) = passed.remove(&h) {
+                let i = usize::from(mesh.corners(triangle(h)).iter().any(is_above));
+                let edge = [mesh.origin(h), mesh.target(h)].map(|v| numbers[i][v as usize]);
+                halves[i].borders.push((edge, points));
+            }
+        }
+    }
+    Simplified { halves, apart, vertical: (!errors.is_empty()).then_some(0.0) }
+}
+
+/// Whether it is sure that nothing goes: in the source's own mesh of a whole square, where nothing may be lost, and there is
+/// no gap, no vertex has flat surroundings.
+fn stays(merged: &Merged, square: &Square, rules: &Rules, until: &Until<'_>) -> bool {
+    let (Until::Error { ground, vertical: 0.0, .. }, Some(upper)) = (until, square.upper) else {
+        return false;
+    };
+    // Each triangle has half a cell.
+    let area = |apex: Vertex| turn(square.a, square.b, apex).unsigned_abs();
+    let all = area(square.lower) + area(upper);
+    let may_go = |v: &&Vertex| ground.may_be_plane(**v) && square.role(**v) != Role::Locked;
+    merged.is_source
+        && merged.patch.triangles.len() as u64 == all
+        && !merged.patch.vertices.iter().filter(may_go).any(|v| is_flat(*v, *ground, rules))
+}
+
+/// Whether the surroundings of a vertex of the source's mesh are a plane: as [`Costs`] would say it of the whole mesh, to
+/// the last bit.
+fn is_flat(v: Vertex, ground: Ground<'_>, rules: &Rules) -> bool {
+    let (mut points, mut triangles) = (Vec::new(), Vec::new());
+    let cells = [[1, 1], [0, 1], [1, 0], [0, 0]].map(|[west, south]| halves_of_cell(v.x - west, v.y - south));
+    for corners in cells.as_flattened().iter().filter(|corners| corners.contains(&[v.x, v.y])) {
+        triangles.push(corners.map(|[x, y]| {
+            let is_it = |point: &Vertex| [point.x, point.y] == [x, y];
+            let number = points.iter().position(is_it).unwrap_or_else(|| {
+                points.push(Vertex { x, y, height: ground.at(x, y) });
+                points.len() - 1
+            });
+            u32::try_from(number).unwrap_or(NONE)
+        }));
+    }
+    let (mesh, mut star) = (Mesh::new(&points, &triangles), Star::default());
+    let Some(centre) = points.iter().position(|point| *point == v) else { return true };
+    mesh.look(u32::try_from(centre).unwrap_or(NONE), &mut star);
+    Costs::new(&mesh, Metric::Normal, rules.lambda, rules.scale).importance(&mesh, &star).1
 }
 
 /// How far samples are from each triangle, in quanta: measured where that is asked and not known.
@@ -281,43 +380,82 @@ fn find_passed(mesh: &Mesh, merged: &Merged) -> Passed {
     passed
 }
 
-/// Cuts a mesh along the hypotenuse.
-fn cut(mesh: &Mesh, mut passed: Passed, errors: &[f32], needs: &[u16], square: &Square) -> [Tin; 2] {
+/// What is told of triangles and vertices, by their numbers; or nothing.
+struct Told<'a> {
+    errors: &'a [f32],
+    needs: &'a [u16],
+    untouched: &'a [bool],
+}
+
+/// Cuts so many triangles, each given with its number, along the hypotenuse. With the numbers of the vertices in each half.
+fn cut(
+    points: &[Vertex],
+    live: usize,
+    triangles: impl Iterator<Item = (usize, [u32; 3])>,
+    told: &Told<'_>,
+    square: &Square,
+) -> ([Tin; 2], [Vec<u32>; 2]) {
     let mut halves = [Tin::default(), Tin::default()];
-    let mut numbers = [vec![NONE; mesh.points.len()], vec![NONE; mesh.points.len()]];
-    let is_above = |v: u32| turn(square.a, square.b, mesh.points[v as usize]) > 0;
-    let side = |[a, b, c]: [u32; 3]| usize::from(is_above(a) || is_above(b) || is_above(c));
+    let mut numbers = [vec![NONE; points.len()], vec![NONE; points.len()]];
+    let is_above: Vec<bool> = points.iter().map(|v| turn(square.a, square.b, *v) > 0).collect();
     for half in &mut halves {
         // Each has about half of the triangles, and half as many vertices.
-        half.triangles.reserve(mesh.live / 2);
-        half.vertices.reserve(mesh.live / 4);
+        half.triangles.reserve(live / 2);
+        half.errors.reserve(told.errors.len().min(live / 2));
+        half.vertices.reserve(live * 5 / 16);
+        half.needs.reserve(told.needs.len().min(live * 5 / 16));
+        half.untouched.reserve(told.untouched.len().min(live * 5 / 16));
     }
-    for (number, t) in mesh.triangles() {
-        let i = side(t);
+    for (number, t) in triangles {
+        let i = usize::from(t.iter().any(|v| is_above[*v as usize]));
         let (half, numbers) = (&mut halves[i], &mut numbers[i]);
-        half.errors.extend(errors.get(number));
-        let mut name = |v: u32| {
+        half.errors.extend(told.errors.get(number));
+        half.triangles.push(t.map(|v| {
             let number = &mut numbers[v as usize];
             if *number == NONE {
                 *number = u32::try_from(half.vertices.len()).unwrap_or(NONE);
-                half.vertices.push(mesh.points[v as usize]);
-                half.needs.extend(needs.get(v as usize));
+                half.vertices.push(points[v as usize]);
+                half.needs.extend(told.needs.get(v as usize));
+                half.untouched.extend(told.untouched.get(v as usize));
             }
             *number
-        };
-        let [a, b, c] = t;
-        half.triangles.push([name(a), name(b), name(c)]);
+        }));
     }
-    if passed.is_empty() {
-        return halves;
-    }
-    for h in mesh.borders() {
-        if let Some(points) = passed.remove(&h) {
-            let i = side(mesh.corners(triangle(h)));
-            halves[i]
-                .borders
-                .push(([mesh.origin(h), mesh.target(h)].map(|v| numbers[i][v as usize]), points));
+    (halves, numbers)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Scale;
+    use super::super::tests::Field;
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        /// Few heights, so that some squares have a vertex in a plane and some have not; or a gap.
+        #[test]
+        fn what_stays_is_cut_as_a_mesh_would_be(
+            heights in prop::collection::vec(0..4, 17 * 17),
+            gap in prop::option::of(0usize..17 * 17),
+            slope in 0..3,
+        ) {
+            let forest = Forest::new(4, 2, [1, 1]).unwrap();
+            let field = Field::new(forest, |x, y| {
+                let i = (17 * y + x) as usize;
+                if gap == Some(i) { NODATA } else { heights[i] + slope * x.cast_signed() }
+            });
+            let scale = Scale { cell: [30.0, 20.0], quantum: 1.0 };
+            let rules =
+                Rules { metric: Metric::Normal, lambda: 1.0, scale, triangles_max: 4096, vertices_max: 4096 };
+            let until = Until::Error { ground: field.ground(), vertical: 0.0, border: 0.0 };
+            for d in (1..=forest.levels()).flat_map(|level| forest.diamonds(level)) {
+                let merged = source(&forest, d, field.ground());
+                let square = square(&forest, d);
+                if stays(&merged, &square, &rules, &until) {
+                    let expected = collapsed(&merged, square, &rules, until);
+                    prop_assert_eq!(simplify(&forest, d, &merged, &rules, until), expected);
+                }
+            }
         }
     }
-    halves
 }

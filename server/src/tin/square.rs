@@ -30,11 +30,26 @@ impl Square {
         (0..4).all(|i| turn(corners[i], corners[(i + 1) % 4], v) >= 0)
     }
 
+    /// Cells along x or y, whichever are more.
+    pub(super) fn width(&self) -> u32 {
+        let corners = [self.a, self.b, self.lower].into_iter().chain(self.upper);
+        let all = |w: fn(Vertex) -> u32| {
+            corners.clone().map(w).fold((u32::MAX, 0), |(low, high), w| (low.min(w), high.max(w)))
+        };
+        let (x, y) = (all(|v| v.x), all(|v| v.y));
+        (x.1 - x.0).max(y.1 - y.0)
+    }
+
+    /// Whether a point lies on the line of the hypotenuse.
+    pub(super) fn is_along(&self, v: Vertex) -> bool {
+        turn(self.a, self.b, v) == 0
+    }
+
     pub(super) fn role(&self, v: Vertex) -> Role {
         let on_side = |apex: Vertex| turn(self.a, apex, v) == 0 || turn(apex, self.b, v) == 0;
         if on_side(self.lower) || self.upper.is_some_and(on_side) {
             Role::Locked
-        } else if turn(self.a, self.b, v) == 0 {
+        } else if self.is_along(v) {
             Role::Along
         } else {
             Role::Free

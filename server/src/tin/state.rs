@@ -14,12 +14,14 @@ pub(super) struct State {
     /// Whether both are known.
     pub(super) is_known: bool,
     pub(super) role: Role,
+    /// Whether anything around it has gone.
+    pub(super) is_touched: bool,
 }
 
 impl State {
     /// Of a vertex that nothing is known of but where it lies.
     pub(super) fn new(role: Role) -> Self {
-        Self { key: 0.0, needed: 0.0, flat: false, is_known: false, role }
+        Self { key: 0.0, needed: 0.0, flat: false, is_known: false, role, is_touched: false }
     }
 
     /// Numbers that sort as the keys do, none of which is negative, and of equal keys as the vertices: so that the order

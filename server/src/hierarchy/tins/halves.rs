@@ -213,6 +213,7 @@ mod tests {
             errors: vec![0.5, 7.25],
             needs: (0..vertices).map(|i| u16::try_from(i % 7).unwrap()).collect(),
             lost: 12.5,
+            untouched: Vec::new(),
         }
     }
 

@@ -13,7 +13,6 @@ use crate::tin::{Ground, Merged, Simplified, Tin, Until, half_of, merge, simplif
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::message::PAYLOAD_BYTES_MAX;
-use diamantina_protocol::tin;
 use rayon::prelude::*;
 use std::collections::HashMap;
 
@@ -83,7 +82,7 @@ impl Tins<'_> {
             if self.work.progress.is_out_of_patience() {
                 return Err(self.work.interrupted());
             }
-            let merged = match (input, &window) {
+            let mut merged = match (input, &window) {
                 (Some((halves, place)), _) => {
                     let quarter = |child: Option<Diamond>| match child {
                         Some(c) => halves.get(place(c), half_of(forest, c, *d)),
@@ -97,7 +96,7 @@ impl Tins<'_> {
                 (None, Some(window)) => self.of_finest(&deep, *d, ground(window), &mut finest),
                 (None, None) => Merged::default(),
             };
-            tile.done.push(self.diamond(*d, &merged, window.as_ref(), output)?);
+            tile.done.push(self.diamond(*d, &mut merged, window.as_ref(), output)?);
         }
         for (simplified, vertical) in finest.values() {
             tile.finest = [tile.finest[0].max(*vertical), tile.finest[1].max(simplified.apart)];
@@ -109,7 +108,7 @@ impl Tins<'_> {
     fn diamond(
         &self,
         d: Diamond,
-        merged: &Merged,
+        merged: &mut Merged,
         window: Option<&Window>,
         output: &Halves,
     ) -> Result<Triangulated, BuildError> {
@@ -123,8 +122,7 @@ impl Tins<'_> {
         if triangles == 0 {
             return Ok(one);
         }
-        let payload =
-            tin::encode(forest, d, &merged.patch).map_err(|error| BuildError::Patch { centre, error })?;
+        let payload = merged.encode(forest, d).map_err(|error| BuildError::Patch { centre, error })?;
         if payload.len() as u64 > u64::from(PAYLOAD_BYTES_MAX) {
             return Err(BuildError::Payload { centre, bytes: payload.len() });
         }
