@@ -679,7 +679,9 @@ impl<'a, W: Witness> Walk<'a, W> {
         // Where plain ground begins that the horizon does not know yet.
         let mut plain = None;
         let [mut looked, mut tried] = [[usize::MAX; BLOCKS_LOG2.len()]; 2];
-        'blocks: while column < columns {
+        // A block that is passed over may end beyond the relief's sides, where cells would have ended the walk.
+        let rows = 0.0..=(plane.sizes[1] - 1) as f64;
+        'blocks: while column < columns && rows.contains(&from.minor) {
             // A block of plain ground, as large as there is.
             let mut beyond = None;
             for which in 0..BLOCKS_LOG2.len() {

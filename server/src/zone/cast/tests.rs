@@ -292,7 +292,25 @@ fn by_each_ray(relief: &Relief, optics: &Optics, eyes: &[Eye]) -> Vec<u8> {
     mask
 }
 
-/// Where blocks of all kinds become plain, and where holes open windows.
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(200))]
+    #[test]
+    fn what_rays_know_of_others_changes_no_mask(
+        relief in any_relief(),
+        above in prop::collection::vec(any_eye(), 1..4),
+        bend in prop::sample::select(vec![0.0, BEND, 1e-4]),
+        angle in prop::sample::select(vec![0.0, 1e-3, 1e-2, 0.1]),
+    ) {
+        let optics = Optics { angle, ..optics(bend) };
+        let eyes: Vec<Eye> = above.into_iter().map(|above| eye_over(&relief, above)).collect();
+        // From the same places again, all that is seen is known.
+        let twice = [eyes.clone(), eyes.clone()].concat();
+        let mask = cast(&relief, &optics, &twice, &Progress::hidden()).unwrap();
+        prop_assert_eq!(mask.rows().collect::<Vec<u8>>(), by_each_ray(&relief, &optics, &eyes));
+    }
+}
+
+/// The same where blocks of all kinds become plain, and where holes open windows.
 #[test]
 fn what_rays_know_of_others_changes_no_mask_of_rough_ground() {
     let side = 200usize;
