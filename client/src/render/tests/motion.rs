@@ -190,6 +190,8 @@ fn a_motion_starts_as_the_picture_before_and_ends_as_the_one_after() {
             [from, to].map(|most| world.surfaces.keys().copied().filter(|d| d.level() < most).collect());
         let mut play = Play::new(world);
         play.step(&before, |_| false);
+        // After a rest as many begin at once as ever may.
+        play.frame += 2 * FRAMES;
         let mut cut = play.step(&after, |_| true);
         let at = |play: &Play<'_>, part: f64| {
             Moment::at((f64::from(play.frame) / f64::from(FRAMES) + part) * SECONDS)
