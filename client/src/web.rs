@@ -123,7 +123,7 @@ fn options(address: &Address, token: Option<String>) -> Result<terrain::Options,
         fade_seconds: FADE_SECONDS,
         layers: address.asked("layer").map(|names| names.split(',').map(str::to_owned).collect()),
         zone: address.asked("zone"),
-        time: viewer::time_at(&address.view).unwrap_or(0.0),
+        time: viewer::View::parse(&address.view, [1, 1]).and_then(|view| view.seconds).unwrap_or(0.0),
         imagery: Imagery::asked(address.asked("texture")),
         fetch: fetch::Options {
             encoding,
