@@ -82,7 +82,7 @@ impl Moment {
 }
 
 /// The motion of a point: how far above its own height it is drawn, in quanta, and with which normal (east and
-/// north, as [`normal`] gives them). 20 bytes, as the GPU takes them.
+/// north, as [`normal`](crate::surface::normal) gives them). 20 bytes, as the GPU takes them.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub struct Record {

@@ -64,7 +64,7 @@ impl Points {
         &self.block
     }
 
-    /// The normal at each slot of the block, as [`normal`] gives it.
+    /// The normal at each slot of the block, as [`normal`](super::normal) gives it.
     #[must_use]
     pub fn normals(&self) -> &[[i16; 2]] {
         &self.normals
