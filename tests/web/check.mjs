@@ -93,21 +93,6 @@ async function frames(page, count) {
     while ((await state(page)).frames < frames + count) await page.waitForTimeout(20);
 }
 
-/// Fingers that go from one place each to another, frame by frame.
-async function touch(page, fingers) {
-    const session = await page.context().newCDPSession(page);
-    const send = async (type, part) => {
-        const touchPoints = part === null ? [] : fingers.map(([from, to], id) =>
-            ({ id, x: from[0] + (to[0] - from[0]) * part, y: from[1] + (to[1] - from[1]) * part }));
-        await session.send('Input.dispatchTouchEvent', { type, touchPoints });
-        await frames(page, 2);
-    };
-    await send('touchStart', 0);
-    for (const part of [0.25, 0.5, 0.75, 1]) await send('touchMove', part);
-    await send('touchEnd', null);
-    await session.detach();
-}
-
 async function heights(page, reference, blank, graphics) {
     const query = `error=${ERROR_PIXELS}${graphics === 'webgl' ? '&graphics=webgl' : ''}`;
     await page.goto(`${url}/?scene=hills&${query}${hash(VIEW)}`);
@@ -165,19 +150,6 @@ async function heights(page, reference, blank, graphics) {
     await page.evaluate((there) => { location.hash = there; }, hash(VIEW));
     await page.waitForFunction(() => window.diamantina.state().view.startsWith('2500.00,500.00,2600.00,25.000,32.000'),
         null, { timeout: PATIENCE });
-
-    // Fingers: two that part go nearer to what is between them, one moves the ground.
-    const eye = async () => (await state(page)).view.split(',').slice(0, 3).map(Number);
-    const beside = (by) => [GROUND[0] + by, GROUND[1]];
-    const high = await eye();
-    await touch(page, [[beside(-40), beside(-80)], [beside(40), beside(80)]]);
-    await settled(page);
-    const low = await eye();
-    check(low[2] < high[2] - 200, `two fingers part, and the eye goes from ${high} to ${low}`);
-    await touch(page, [[GROUND, beside(80)]]);
-    await settled(page);
-    const aside = await eye();
-    check(Math.hypot(aside[0] - low[0], aside[1] - low[1]) > 50, `a finger moves the ground, and the eye goes from ${low} to ${aside}`);
 
     // The panel's first slider: more error, fewer triangles.
     const { triangles } = await state(page);
