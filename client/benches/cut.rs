@@ -88,6 +88,34 @@ fn arrive(criterion: &mut Criterion, layer: &Layer, surfaces: &Surfaces, d: Diam
     group.finish();
 }
 
+/// Drawing from within the boxes of finest diamonds, the worst of which are looked at cell by cell.
+fn hover(criterion: &mut Criterion) {
+    let layer = Layer {
+        finest_error: 1.0,
+        ..layer(Forest::new(9, 6, [1, 1]).expect("within the documented limits"))
+    };
+    let (surfaces, ..) = rough(&layer, layer.forest.levels() - 1);
+    let eye = DVec3::new(500_000.0 + 7800.0, 4_000_000.0 + 7800.0, 200.0);
+    let camera = Camera { eye, target: eye + DVec3::new(1.0, 1.0, -0.3), fov_y: FOV_Y, size: [1380, 768] };
+    let ask = Ask {
+        layer: &layer,
+        encoding: Encoding::Points,
+        camera: &camera,
+        exaggeration: 1.0,
+        tolerance_pixels: 1.0,
+        sight: Sight::default(),
+        seen: None,
+        memory_bytes: usize::MAX,
+        gpu: None,
+    };
+    let ideal = cut::choose(&ask, |_| Some(Entry { error_metres: 200.0, low: 0, high: 255, bytes: 2000 }));
+    let mut group = criterion.benchmark_group("cut");
+    group.bench_function("draw_hovering", |b| {
+        b.iter(|| cut::draw(0, black_box(&ask), &ideal, |d| surfaces.get(&d).cloned()));
+    });
+    group.finish();
+}
+
 /// A frame in which as many motions begin as may, over parents that move.
 fn begin(criterion: &mut Criterion, layer: &Layer, surfaces: &Surfaces) {
     let wanted: Vec<Diamond> = (0..=7).flat_map(|level| layer.forest.diamonds(level)).collect();
@@ -153,5 +181,6 @@ fn main() {
     let (surfaces, newest, payload) = rough(&layer, 7);
     arrive(&mut criterion, &layer, &surfaces, newest, &payload);
     begin(&mut criterion, &layer, &surfaces);
+    hover(&mut criterion);
     criterion.final_summary();
 }

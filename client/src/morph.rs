@@ -265,6 +265,12 @@ impl Morphs {
         self.motions_max = motions_max.min(MOTIONS_MAX);
     }
 
+    /// The diamonds whose points move.
+    #[cfg(test)]
+    pub(crate) fn moving(&self) -> impl Iterator<Item = Diamond> {
+        self.motions.keys().copied()
+    }
+
     /// Whether anything ever moves.
     #[must_use]
     pub fn is_on(&self) -> bool {

@@ -2,7 +2,7 @@
 //!
 //! The box of a diamond says little of one that the eye hovers over, or stands in: a hollow below a summit of the same
 //! box is far away, and the box is not. What is drawn is known, so its cells or triangles tell how near any of it
-//! comes, each by a box of its own. That takes some 0.1 ms a diamond, so it is asked of the worst few alone.
+//! comes, each by a box of its own. That takes some 0.1 ms a diamond (bench `cut/draw_hovering`), so it is asked of the worst few alone.
 
 use super::Ask;
 use crate::camera::Bounds;

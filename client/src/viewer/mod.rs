@@ -140,8 +140,7 @@ pub struct Viewer {
 impl Viewer {
     /// A viewer of the scene at `url` that begins with a view, or with an overview.
     #[must_use]
-    pub fn new(mut terrain: Terrain, url: &str, look: Look, size: [u32; 2], view: Option<View>) -> Self {
-        let mut look = look;
+    pub fn new(mut terrain: Terrain, url: &str, mut look: Look, size: [u32; 2], view: Option<View>) -> Self {
         if let Some(exaggeration) =
             view.and_then(|view| view.exaggeration).filter(|_| look != look.truthful())
         {

@@ -136,7 +136,8 @@ impl<'a> Mesh<'a> {
 /// edge starts, or [`NONE`]; and an edge with two triangles on the same side, if there is one. Nothing if it is no patch
 /// for another reason.
 pub(super) fn across(triangles: &[[u32; 3]], count: usize) -> (Vec<Corner>, Option<[u32; 2]>) {
-    if triangles.len() > TRIANGLES_MAX || triangles.as_flattened().iter().any(|v| *v as usize >= count) {
+    let has_numbers = triangles.len() <= NONE as usize / STRIDE;
+    if !has_numbers || triangles.as_flattened().iter().any(|v| *v as usize >= count) {
         return (Vec::new(), None);
     }
     // The corners of each vertex, with where their edges end. One place too far to begin with: filling the list

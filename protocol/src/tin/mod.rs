@@ -185,7 +185,7 @@ impl Units {
 /// # Errors
 /// When it is no patch of this diamond.
 pub fn encode(forest: &Forest, d: Diamond, patch: &Patch) -> Result<Vec<u8>, PatchError> {
-    encode_with(forest, d, patch, &Neighbours::of(patch))
+    encode_with(forest, d, patch, &Neighbours::of(&patch.triangles, patch.vertices.len()))
 }
 
 /// Which triangles of a patch have an edge in common. Takes 16 bytes a triangle.
@@ -197,10 +197,11 @@ pub struct Neighbours {
 }
 
 impl Neighbours {
-    /// Those of a patch. Of what is none the outcome has no meaning but to [`encode_with`], which refuses it.
+    /// Those of triangles of so many vertices. Of what is no patch the outcome has no meaning but to [`encode_with`], which
+    /// refuses it.
     #[must_use]
-    pub fn of(patch: &Patch) -> Self {
-        let (across, repeated) = mesh::across(&patch.triangles, patch.vertices.len());
+    pub fn of(triangles: &[[u32; 3]], vertices: usize) -> Self {
+        let (across, repeated) = mesh::across(triangles, vertices);
         Self { across, repeated }
     }
 

@@ -17,6 +17,7 @@
 //! Where triangles touch in a point alone (nodata may leave such), that point is a vertex for each fan of them.
 
 use super::Vertex;
+use diamantina_protocol::tin::Neighbours;
 
 /// No half-edge, vertex or triangle.
 pub(super) const NONE: u32 = u32::MAX;
@@ -105,7 +106,7 @@ impl Star {
 impl Mesh {
     /// The mesh of some triangles, counterclockwise in plan, no two of which overlap.
     pub(super) fn new(points: &[Vertex], triangles: &[[u32; 3]]) -> Self {
-        Self::with_twins(points, triangles, &twins(points.len(), triangles))
+        Self::with_twins(points, triangles, Neighbours::of(triangles, points.len()).across())
     }
 
     /// [`Mesh::new`] given the twin of each half-edge.
@@ -310,41 +311,6 @@ impl Mesh {
         }
         moved
     }
-}
-
-/// The twin of each half-edge of some triangles of so many vertices.
-fn twins(count: usize, triangles: &[[u32; 3]]) -> Vec<u32> {
-    // The half-edges that leave each vertex, with what they lead to, and the position of its first. One place too far to
-    // begin with: filling the list moves each to where it belongs.
-    let mut starts = vec![0u32; count + 2];
-    for v in triangles.as_flattened() {
-        starts[*v as usize + 2] += 1;
-    }
-    let mut sum = 0;
-    for start in &mut starts {
-        sum += *start;
-        *start = sum;
-    }
-    let mut list = vec![[0u32; 2]; 3 * triangles.len()];
-    for (t, [a, b, c]) in (0..).step_by(STRIDE).zip(triangles) {
-        for (h, from, to) in [(t, a, b), (t + 1, b, c), (t + 2, c, a)] {
-            let at = &mut starts[*from as usize + 1];
-            list[*at as usize] = [h, *to];
-            *at += 1;
-        }
-    }
-    let leaving = |v: u32| &list[starts[v as usize] as usize..starts[v as usize + 1] as usize];
-    let mut twins = vec![NONE; STRIDE * triangles.len()];
-    for from in 0..index(count) {
-        // Each edge once, from its lower end.
-        for [h, to] in leaving(from).iter().filter(|[_, to]| *to > from) {
-            if let Some([twin, _]) = leaving(*to).iter().find(|[_, back]| *back == from) {
-                twins[*h as usize] = *twin;
-                twins[*twin as usize] = *h;
-            }
-        }
-    }
-    twins
 }
 
 fn index(count: usize) -> u32 {

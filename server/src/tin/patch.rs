@@ -64,7 +64,7 @@ impl Merged {
     /// # Errors
     /// When it is no patch of this diamond.
     pub fn encode(&mut self, forest: &Forest, d: Diamond) -> Result<Vec<u8>, PatchError> {
-        let neighbours = Neighbours::of(&self.patch);
+        let neighbours = Neighbours::of(&self.patch.triangles, self.patch.vertices.len());
         let bytes = encode_with(forest, d, &self.patch, &neighbours)?;
         self.neighbours = Some(neighbours);
         Ok(bytes)

@@ -251,3 +251,24 @@ fn the_gpu_takes_records_as_they_are_and_drops_them_when_they_are_over() {
     let records = (5 * 5 + 4 * 4) * size_of::<morph::Record>() as u64;
     assert_eq!((none, last.gpu_bytes), (0, first.gpu_bytes - moving * records));
 }
+
+/// So many begin as the time since the last frame has room for, and no more than ever may.
+#[test]
+fn short_frames_begin_few_motions() {
+    let world = world();
+    let mut play = Play::new(&world);
+    let roots: HashSet<Diamond> = world.layer.forest.root_diamonds().collect();
+    play.step(&roots, |_| true);
+    play.frame += 2 * FRAMES;
+    let all = any_splits(&world.layer.forest, 1, 1.0);
+    let begun = |play: &mut Play<'_>| {
+        let known: HashSet<Diamond> = play.morphs.moving().collect();
+        play.step(&all, |_| true);
+        play.morphs.moving().filter(|d| !known.contains(d)).count()
+    };
+    let rested: usize = begun(&mut play);
+    assert!(rested > 0 && rested <= morph::STARTS_MAX, "{rested}");
+    // A frame of 31 ms.
+    let short: Vec<usize> = (0..6).map(|_| begun(&mut play)).collect();
+    assert!(short.iter().all(|count| *count <= 32) && short.contains(&32), "{short:?}");
+}

@@ -3,6 +3,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+use super::sheets::stepped;
 use super::*;
 use proptest::prelude::*;
 use std::collections::BTreeMap;
