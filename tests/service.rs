@@ -2,8 +2,11 @@
 
 use crate::hostile::{Ended, end, start};
 use crate::limits::{answer, connect};
-use crate::world::{Served, World, asker, programs, serve_with, serve_within};
+use crate::world::{
+    Served, World, asker, build, options, programs, serve, serve_with, serve_within, write_raw,
+};
 use diamantina_protocol::message;
+use diamantina_server::hierarchy;
 use diamantina_server::http::{self, Limits, Options};
 use diamantina_server::inspect;
 use diamantina_server::store::Store;
@@ -74,7 +77,11 @@ fn store(world: &World) -> PathBuf {
 
 /// The routes of some diamonds with a payload, coarse first, and one that asks for them all.
 fn diamonds(world: &World, count: usize) -> (Vec<String>, String) {
-    let store = Store::open(&store(world)).unwrap();
+    diamonds_of(&store(world), count)
+}
+
+fn diamonds_of(store: &Path, count: usize) -> (Vec<String>, String) {
+    let store = Store::open(store).unwrap();
     let layer = &store.scene().layers[0];
     let entries = inspect::entries(&store, 0, layer).unwrap();
     let mut found: Vec<_> = entries.into_iter().filter(|(_, entry)| entry.bytes > 0).collect();
@@ -184,6 +191,40 @@ fn what_is_asked_for_again_is_not_read_again_and_all_of_it_is_counted() {
         assert!(get(&format!("{}{}", none.address, routes[0])).body == first[0]);
     }
     assert_eq!(metric(&none, "diamantina_store_reads_total"), 2.0, "nothing is kept without a budget");
+}
+
+/// Blobs too large to be copied into the kernel each time, of noise.
+#[test]
+#[cfg(target_os = "linux")]
+fn large_blobs_that_are_asked_for_again_are_sent_by_the_kernel_and_are_the_same() {
+    let folder = tempfile::tempdir().unwrap();
+    let (dem, at) = (folder.path().join("dem.raw"), folder.path().join("store"));
+    let noise = |x: u32, y: u32| x.wrapping_mul(0x9e37_79b1).wrapping_add(y.wrapping_mul(0x85eb_ca6b));
+    let ingest = write_raw(&dem, [257, 257], |x, y| {
+        let mixed = noise(x, y) ^ (noise(x, y) >> 15);
+        Some((mixed.wrapping_mul(0x2c1b_3c6d) >> 9) as f32)
+    });
+    build(&dem, &at, &ingest, &hierarchy::Options { patch_log2: 7, max_error: 0.0, ..options() });
+    let (routes, _) = diamonds_of(&at, usize::MAX);
+    let served = serve(&[at]);
+    let urls: Vec<String> = routes.iter().map(|route| format!("{}{route}", served.address)).collect();
+    let first: Vec<Vec<u8>> = urls.iter().map(|url| get(url).body).collect();
+    let large: usize = first.iter().map(Vec::len).filter(|length| *length >= 16 << 10).sum();
+    assert!(large > 0, "{:?}", first.iter().map(Vec::len).collect::<Vec<_>>());
+    let taken = || metric(&served, "diamantina_sent_uncopied_bytes_total");
+    assert_eq!(taken(), 0.0, "nothing was asked for again");
+    for round in 1..3 {
+        for (url, first) in urls.iter().zip(&first) {
+            assert!(ask(Method::HEAD, url, &[]).body.is_empty());
+            assert!(get(url).body == *first);
+        }
+        // An answer may have come before it is counted.
+        let begun = Instant::now();
+        while taken() < (round * large) as f64 && begun.elapsed() < Duration::from_secs(10) {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        assert_eq!(taken(), (round * large) as f64);
+    }
 }
 
 #[test]

@@ -6,6 +6,7 @@
 //! | module | what it holds |
 //! |---|---|
 //! | `accept`, `still` | the loop that accepts connections, and the end of those that take too long |
+//! | `sendfile` | blobs that the kernel sends by itself |
 //! | `tls` | encryption, with a certificate that changes |
 //! | `limits` | what is allowed |
 //! | `front` | what every request meets before the routes, and every answer after them |
@@ -27,6 +28,7 @@ mod many;
 mod metrics;
 mod routes;
 mod scenes;
+mod sendfile;
 mod still;
 mod tls;
 mod viewer;
@@ -42,6 +44,7 @@ use blobs::Blobs;
 use front::Front;
 use metrics::Metrics;
 use scenes::Scenes;
+use sendfile::Files;
 use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::PathBuf;
@@ -221,7 +224,9 @@ impl Server {
         runtime.block_on(async move {
             let listener = tokio::net::TcpListener::from_std(self.listener)?;
             let metrics = Arc::new(Metrics::new(self.shared));
-            let blobs = Arc::new(Blobs::new(self.limits.cache, Arc::clone(&metrics)));
+            // What is encrypted is written by this process in any case.
+            let files = if self.tls.is_none() { Files::new() } else { None };
+            let blobs = Arc::new(Blobs::new(self.limits.cache, files, Arc::clone(&metrics)));
             let (scenes, access, viewer) = (self.scenes, self.access, self.viewer);
             let site = Arc::new(Site { scenes, blobs, access, viewer, metrics });
             let front = Arc::new(Front::new(Arc::clone(&site), &self.limits));

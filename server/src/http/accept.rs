@@ -7,6 +7,7 @@ use super::access::subscriber;
 use super::front::{Connection, Front};
 use super::limits::{HEAD_BYTES_MAX, Limits, STREAMS_MAX, URI_BYTES_MAX};
 use super::metrics::Metrics;
+use super::sendfile::{Outbox, Sender};
 use super::still::{Activity, Noted, Patience, Watched};
 use super::tls::Tls;
 use hyper::service::service_fn;
@@ -119,18 +120,21 @@ impl Door {
         // Frames of a batch are small, and wait for nothing.
         let _ = stream.set_nodelay(true);
         let acceptor = self.tls.as_ref().map(|tls| (tls.acceptor(), self.handshake));
+        let outbox = Arc::new(Outbox::new(self.front.metrics().sent_uncopied_bytes.clone()));
         let visit = Visit {
             builder: Arc::clone(&self.builder),
             front: Arc::clone(&self.front),
             watcher: self.graceful.watcher(),
-            connection: Arc::new(Connection { activity: Activity::new(), from }),
+            connection: Arc::new(Connection { activity: Activity::new(), from, outbox: Arc::clone(&outbox) }),
             patience: self.patience,
         };
         let Ok(stream) = stream.into_std() else { return };
         self.crew.spawn(async move {
             let _place = place;
             let Ok(stream) = TcpStream::from_std(stream) else { return };
-            let Some((acceptor, patience)) = acceptor else { return visit.serve(stream).await };
+            let Some((acceptor, patience)) = acceptor else {
+                return visit.serve(Sender::new(stream, outbox)).await;
+            };
             let noted = Noted::new(stream, Arc::clone(&visit.connection.activity));
             match tokio::time::timeout(patience, acceptor.accept(noted)).await {
                 Ok(Ok(encrypted)) => visit.serve(encrypted).await,

@@ -2,8 +2,10 @@
 //!
 //! A blob is read from its store, and checked there, at most once as long as it is kept; answers share its bytes. What is
 //! asked for again and again stays, what is asked for once soon goes (quick_cache's S3-FIFO), and the budget is of bytes.
+//! What is asked for again by itself also lies where the kernel can take it from.
 
 use super::metrics::Metrics;
+use super::sendfile::{Filed, Files};
 use crate::store::{Key, Store, StoreError, number};
 use bytes::Bytes;
 use quick_cache::sync::{Cache, DefaultLifecycle};
@@ -24,19 +26,34 @@ pub(super) type Read = Result<Option<Bytes>, StoreError>;
 /// A blob of a version of a scene; a version is a hash of all its content.
 type Name = (u64, Key);
 
+/// A blob, and its copy for the kernel, if there is one.
+#[derive(Debug, Clone)]
+pub(super) struct Blob {
+    pub(super) bytes: Bytes,
+    pub(super) filed: Option<Arc<Filed>>,
+}
+
+impl From<Bytes> for Blob {
+    fn from(bytes: Bytes) -> Self {
+        Self { bytes, filed: None }
+    }
+}
+
 #[derive(Debug, Clone)]
 struct ByBytes;
 
-impl Weighter<Name, Bytes> for ByBytes {
-    fn weight(&self, _: &Name, blob: &Bytes) -> u64 {
-        blob.len() as u64 + OVERHEAD_BYTES
+impl Weighter<Name, Blob> for ByBytes {
+    fn weight(&self, _: &Name, blob: &Blob) -> u64 {
+        let copy = blob.filed.as_ref().map_or(0, |filed| filed.weight());
+        blob.bytes.len() as u64 + copy + OVERHEAD_BYTES
     }
 }
 
 /// Reads blobs, and keeps some.
 #[derive(Debug)]
 pub(super) struct Blobs {
-    cache: Option<Cache<Name, Bytes, ByBytes>>,
+    cache: Option<Cache<Name, Blob, ByBytes>>,
+    files: Option<Arc<Files>>,
     metrics: Arc<Metrics>,
 }
 
@@ -45,24 +62,41 @@ fn name(store: &Store, key: Key) -> Name {
 }
 
 impl Blobs {
-    /// Keeps blobs of at most `budget` bytes; 0 keeps none.
-    pub(super) fn new(budget: u64, metrics: Arc<Metrics>) -> Self {
+    /// Keeps blobs of at most `budget` bytes, their copies in `files` included; 0 keeps none.
+    pub(super) fn new(budget: u64, files: Option<Arc<Files>>, metrics: Arc<Metrics>) -> Self {
         let mut options = OptionsBuilder::new();
         // The number of items is a hint for the first allocation alone.
         options.weight_capacity(budget).estimated_items_capacity(1024).shards(SHARDS);
         let cache = options.build().ok().filter(|_| budget > 0).map(|options| {
             Cache::with_options(options, ByBytes, DefaultHashBuilder::default(), DefaultLifecycle::default())
         });
-        Self { cache, metrics }
+        Self { cache, files, metrics }
     }
 
     /// The blob, if it is kept.
     pub(super) fn held(&self, store: &Store, key: Key) -> Option<Bytes> {
-        let found = self.cache.as_ref()?.get(&name(store, key));
+        Some(self.kept(name(store, key))?.bytes)
+    }
+
+    fn kept(&self, name: Name) -> Option<Blob> {
+        let found = self.cache.as_ref()?.get(&name);
         if found.is_some() {
             self.metrics.cache_hits.inc();
         }
         found
+    }
+
+    /// The blob, if it is kept, with a copy for the kernel from now on.
+    fn filed(&self, name: Name) -> Option<Blob> {
+        let mut blob = self.kept(name)?;
+        if blob.filed.is_none()
+            && let (Some(cache), Some(files)) = (&self.cache, &self.files)
+            && let Some(filed) = files.put(&blob.bytes)
+        {
+            blob.filed = Some(filed);
+            cache.insert(name, blob.clone());
+        }
+        Some(blob)
     }
 
     /// Reads the blob of a key from its store, checked; `None` if there is none. It waits for the disk.
@@ -86,7 +120,7 @@ impl Blobs {
                 self.metrics.store_read_bytes.inc_by(blob.len() as u64);
                 self.metrics.store_read_seconds.observe(seconds);
                 if let Some(cache) = &self.cache {
-                    cache.insert(name(store, key), blob.clone());
+                    cache.insert(name(store, key), blob.clone().into());
                 }
             }
             Err(error) => self.failed(error),
@@ -130,24 +164,24 @@ impl Blobs {
         self: &Arc<Self>,
         store: &Arc<Store>,
         key: Key,
-    ) -> Result<Option<Bytes>, StoreError> {
+    ) -> Result<Option<Blob>, StoreError> {
         if !store.has(key) {
             return Ok(None);
         }
-        if let Some(blob) = self.held(store, key) {
+        if let Some(blob) = self.filed(name(store, key)) {
             return Ok(Some(blob));
         }
         let mut at_hand = HashMap::new();
         self.fetch(store, &[key], &mut at_hand).await;
-        if let Some(read) = at_hand.remove(&key) {
-            return read;
-        }
-        let (blobs, at) = (Arc::clone(self), Arc::clone(store));
-        match tokio::task::spawn_blocking(move || blobs.read(&at, key)).await {
-            Ok(read) => read,
-            // The runtime ends, and nobody waits for this.
-            Err(_) => Ok(None),
-        }
+        let read = match at_hand.remove(&key) {
+            Some(read) => read,
+            None => {
+                let (blobs, at) = (Arc::clone(self), Arc::clone(store));
+                // If it does not end, the runtime does, and nobody waits for this.
+                tokio::task::spawn_blocking(move || blobs.read(&at, key)).await.unwrap_or(Ok(None))
+            }
+        };
+        read.map(|blob| blob.map(Blob::from))
     }
 
     /// Tells the metrics how full the cache is.
@@ -169,9 +203,9 @@ mod tests {
 
     #[test]
     fn what_is_kept_stays_within_its_bytes_and_what_is_asked_for_stays() {
-        let blobs = Blobs::new(8 << 20, Arc::new(Metrics::new(Arc::default())));
+        let blobs = Blobs::new(8 << 20, None, Arc::new(Metrics::new(Arc::default())));
         let cache = blobs.cache.as_ref().unwrap();
-        let blob = Bytes::from(vec![0; 10_000]);
+        let blob = Blob::from(Bytes::from(vec![0; 10_000]));
         for number in 0..5000 {
             cache.insert(name(number), blob.clone());
             // These ten are hot.
@@ -189,7 +223,24 @@ mod tests {
     }
 
     #[test]
+    fn what_is_asked_for_again_has_a_copy_that_counts() {
+        let blobs = Blobs::new(8 << 20, Files::new(), Arc::new(Metrics::new(Arc::default())));
+        let cache = blobs.cache.as_ref().unwrap();
+        for number in 0..5000 {
+            cache.insert(name(number), Bytes::from(vec![0; 10_000]).into());
+            assert!(
+                blobs.filed(name(number)).is_none_or(|blob| blob.filed.is_some() == blobs.files.is_some())
+            );
+            assert!(cache.weight() <= 8 << 20, "{}", cache.weight());
+        }
+        if blobs.files.is_some() {
+            assert!(cache.len() < (8 << 20) / (20_000 + 20_480));
+        }
+        assert!(cache.len() > 100 && blobs.kept(name(4999)).is_some());
+    }
+
+    #[test]
     fn without_a_budget_nothing_is_kept() {
-        assert!(Blobs::new(0, Arc::new(Metrics::new(Arc::default()))).cache.is_none());
+        assert!(Blobs::new(0, None, Arc::new(Metrics::new(Arc::default()))).cache.is_none());
     }
 }

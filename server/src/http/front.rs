@@ -9,6 +9,7 @@ use super::answer::{Cause, Refusal};
 use super::limits::{Limits, RETRY_AFTER, URI_BYTES_MAX};
 use super::metrics::{Metrics, NO_ROUTE, Route};
 use super::routes;
+use super::sendfile::Outbox;
 use super::still::{Activity, Answering};
 use axum::Router;
 use axum::body::{Body, Bytes};
@@ -54,6 +55,7 @@ pub(super) struct Front {
 pub(super) struct Connection {
     pub(super) activity: Arc<Activity>,
     pub(super) from: SocketAddr,
+    pub(super) outbox: Arc<Outbox>,
 }
 
 impl Front {
@@ -114,6 +116,9 @@ impl Front {
         };
         if let Some(Cause(cause)) = response.extensions_mut().remove() {
             tracing::error!(id = ended.id, path = ended.path, %cause, "store");
+        }
+        if let Some(filed) = response.extensions_mut().remove() {
+            connection.outbox.expect(filed);
         }
         ended.route = response.extensions_mut().remove().map_or(NO_ROUTE, |Route(template)| template);
         ended.status = response.status();

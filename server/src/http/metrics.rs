@@ -54,6 +54,8 @@ pub(super) struct Metrics {
     head_seconds: Family<OfRoute, Histogram, fn() -> Histogram>,
     answer_seconds: Family<OfRoute, Histogram, fn() -> Histogram>,
     sent_bytes: Family<OfRoute, Counter>,
+    /// Of these, what the kernel took by itself.
+    pub(super) sent_uncopied_bytes: Counter,
     rejections: Family<Why, Counter>,
     pub(super) in_flight: Gauge,
     pub(super) connections: Gauge,
@@ -83,6 +85,7 @@ impl Metrics {
             head_seconds: Family::new_with_constructor(seconds),
             answer_seconds: Family::new_with_constructor(seconds),
             sent_bytes: Family::default(),
+            sent_uncopied_bytes: Counter::default(),
             rejections: Family::default(),
             in_flight: Gauge::default(),
             connections: Gauge::default(),
@@ -111,6 +114,11 @@ impl Metrics {
             m.answer_seconds.clone(),
         );
         r.register("sent_bytes", "Bytes of answers, without their heads", m.sent_bytes.clone());
+        r.register(
+            "sent_uncopied_bytes",
+            "Bytes of answers that the kernel took by itself",
+            m.sent_uncopied_bytes.clone(),
+        );
         r.register("rejections", "Connections and requests refused for a limit", m.rejections.clone());
         r.register("in_flight", "Answers under way", m.in_flight.clone());
         r.register("connections", "Connections open", m.connections.clone());

@@ -3,6 +3,7 @@
 use super::Site;
 use super::access::Caller;
 use super::answer::{IMMUTABLE, IMMUTABLE_PRIVATE, OCTETS, Refusal, json, tagged};
+use super::blobs::Blob;
 use super::contract::{self, About, Form, Holds};
 use super::many::{self, Batch};
 use super::metrics::{Route, metrics};
@@ -273,6 +274,16 @@ fn tin(layer: &Layer) -> Result<Encoding, Refusal> {
     Ok(Encoding { forest: tin.forest, payload: Kind::Tin, page: Kind::TinIndex, letters: ["t", "j"] })
 }
 
+/// An answer that is a blob.
+fn whole(headers: &HeaderMap, tag: &str, cache: &'static str, kind: &'static str, blob: Blob) -> Response {
+    let Blob { bytes, filed } = blob;
+    let mut response = tagged(headers, tag, cache, kind, || bytes.into());
+    if let Some(filed) = filed {
+        response.extensions_mut().insert(filed);
+    }
+    response
+}
+
 type PagePath = Path<(String, String, String, String)>;
 type DiamondPath = Path<(String, String, String, String, String)>;
 type BatchPath = Path<(String, String, String)>;
@@ -328,7 +339,7 @@ async fn page_of(
     let key = Key { layer: number, kind: encoding.page, a: page, b: 0 };
     let blob = site.blobs.get(&store, key).await?.ok_or_else(missing)?;
     let tag = format!("{version}-{number}-{}{page}", encoding.letters[1]);
-    Ok(tagged(headers, &tag, cache, OCTETS, || blob.into()))
+    Ok(whole(headers, &tag, cache, OCTETS, blob))
 }
 
 /// A page of a layer's points; or the only one of a texture, which tells of all tiles.
@@ -348,7 +359,7 @@ async fn index_page(
         return Err(missing());
     }
     let blob = site.blobs.get(&store, Key::coverage(number)).await?.ok_or_else(missing)?;
-    Ok(tagged(&headers, &format!("{version}-x{number}"), cache, OCTETS, || blob.into()))
+    Ok(whole(&headers, &format!("{version}-x{number}"), cache, OCTETS, blob))
 }
 
 fn find_texture(store: &Store, name: &str) -> Option<u8> {
@@ -374,7 +385,7 @@ async fn tile(
     }
     let blob = site.blobs.get(&store, Key::tile(number, tile)).await?.ok_or_else(no_tile)?;
     let tag = format!("{version}-x{number}-{}-{}-{}", tile.level, tile.x, tile.y);
-    Ok(tagged(&headers, &tag, cache, "image/webp", || blob.into()))
+    Ok(whole(&headers, &tag, cache, "image/webp", blob))
 }
 
 async fn zone(
@@ -388,7 +399,7 @@ async fn zone(
         || Refusal::new(StatusCode::NOT_FOUND, "no such zone: the scene's description lists its zones");
     let position = store.scene().zones.iter().position(|z| z.name == zone).ok_or_else(missing)?;
     let blob = site.blobs.get(&store, zones::key(position)).await?.ok_or_else(missing)?;
-    Ok(tagged(&headers, &format!("{version}-z{position}"), cache, OCTETS, || blob.into()))
+    Ok(whole(&headers, &format!("{version}-z{position}"), cache, OCTETS, blob))
 }
 
 async fn diamond_of(
@@ -407,7 +418,7 @@ async fn diamond_of(
     let key = Key { layer: number, kind: encoding.payload, a: centre[0], b: centre[1] };
     let blob = site.blobs.get(&store, key).await?.ok_or_else(no_diamond)?;
     let tag = format!("{version}-{number}-{}{}-{}", encoding.letters[0], centre[0], centre[1]);
-    Ok(tagged(headers, &tag, cache, OCTETS, || blob.into()))
+    Ok(whole(headers, &tag, cache, OCTETS, blob))
 }
 
 /// A short name for a question: however it was written, the same one has the same.
