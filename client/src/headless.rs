@@ -4,7 +4,7 @@ use crate::annotate::{self, Subject};
 use crate::camera::Camera;
 use crate::drawing::DrawItem;
 use crate::globe::Globe;
-use crate::overview::{around, stretched};
+use crate::overview::{Room, around, stretched};
 use crate::pick::Picker;
 use crate::picture::{Picture, write_png};
 use crate::render::{self, FrameStats, Look, Offscreen, RenderError};
@@ -111,7 +111,7 @@ pub fn framed(terrain: &mut Terrain, size: [u32; 2], exaggeration: f64, patience
             })),
         }
     }
-    if points.is_empty() { camera } else { around(&points, size, exaggeration) }
+    if points.is_empty() { camera } else { around(&points, &Room::whole(size), exaggeration) }
 }
 
 /// All points of a diamond that have a height.

@@ -25,23 +25,48 @@ const FILLED: f64 = 0.95;
 /// A camera that sees a whole scene, from the south and above, as near as the box around it allows.
 #[must_use]
 pub fn overview(scene: &Scene, size: [u32; 2]) -> Camera {
-    around_box(extent(scene), size, 1.0)
+    around_box(extent(scene), &Room::whole(size), 1.0)
 }
 
-fn around_box([low, high]: [DVec3; 2], size: [u32; 2], exaggeration: f64) -> Camera {
-    let corner = |i: u32| DVec3::select(glam::BVec3::new(i & 1 > 0, i & 2 > 0, i & 4 > 0), high, low);
-    around(&(0..8).map(corner).collect::<Vec<_>>(), size, exaggeration)
+fn around_box(bounds: [DVec3; 2], room: &Room, exaggeration: f64) -> Camera {
+    around(&corners(bounds), room, exaggeration)
+}
+
+/// The corners of a box.
+fn corners([low, high]: [DVec3; 2]) -> [DVec3; 8] {
+    std::array::from_fn(|i| DVec3::select(glam::BVec3::new(i & 1 > 0, i & 2 > 0, i & 4 > 0), high, low))
 }
 
 /// As [`overview`], of a scene whose heights are multiplied by `exaggeration` (but the camera's are not).
 #[must_use]
 pub fn stretched_overview(scene: &Scene, size: [u32; 2], exaggeration: f64) -> Camera {
-    around_box(extent(scene), size, exaggeration)
+    around_box(extent(scene), &Room::whole(size), exaggeration)
+}
+
+/// As [`stretched_overview`], in a picture of which so many pixels at its right are covered.
+pub(crate) fn overview_beside(scene: &Scene, size: [u32; 2], covered: u32, exaggeration: f64) -> Camera {
+    around_box(extent(scene), &Room { size, covered }, exaggeration)
+}
+
+/// A picture, and what of it there is to fill.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Room {
+    /// Width and height in pixels.
+    size: [u32; 2],
+    /// Pixels at the right that are covered: fewer than its width.
+    covered: u32,
+}
+
+impl Room {
+    /// A picture of which nothing is covered.
+    pub(crate) fn whole(size: [u32; 2]) -> Self {
+        Self { size, covered: 0 }
+    }
 }
 
 /// The camera from the south and above that holds all points as large as can be. Of the tilts, it takes the
 /// one at which they fill the picture best.
-pub(crate) fn around(points: &[DVec3], size: [u32; 2], exaggeration: f64) -> Camera {
+pub(crate) fn around(points: &[DVec3], room: &Room, exaggeration: f64) -> Camera {
     let points: Vec<DVec3> = points.iter().map(|p| p.with_z(p.z * exaggeration)).collect();
     let low = points.iter().copied().fold(DVec3::INFINITY, DVec3::min);
     let high = points.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max);
@@ -54,33 +79,37 @@ pub(crate) fn around(points: &[DVec3], size: [u32; 2], exaggeration: f64) -> Cam
         });
         (corners[2] - corners[0]).perp_dot(corners[3] - corners[1])
     };
-    let cameras = (TILTS[0]..=TILTS[1]).step_by(3).map(|tilt| fit(&points, tilt, size));
+    let cameras = (TILTS[0]..=TILTS[1]).step_by(3).map(|tilt| fit(&points, tilt, room));
     let best = cameras.max_by(|a, b| filled(a).total_cmp(&filled(b)));
-    let best = best.unwrap_or_else(|| fit(&points, TILTS[0], size));
+    let best = best.unwrap_or_else(|| fit(&points, TILTS[0], room));
     let flat = |p: DVec3| p.with_z(p.z / exaggeration);
     Camera { eye: flat(best.eye), target: flat(best.target), ..best }
 }
 
 /// The camera that looks down by `tilt` degrees and holds all points as large as can be.
-fn fit(points: &[DVec3], tilt: u32, size: [u32; 2]) -> Camera {
+fn fit(points: &[DVec3], tilt: u32, room: &Room) -> Camera {
+    let Room { size, covered } = *room;
     let tilt = f64::from(tilt).to_radians();
     let backward = DVec3::new(0.0, -tilt.cos(), tilt.sin());
     let axes = Camera { eye: backward, target: DVec3::ZERO, fov_y: FOV_Y, size }.axes();
     let tan_y = (FOV_Y / 2.0).tan();
     let tan_x = tan_y * f64::from(size[0].max(1)) / f64::from(size[1].max(1));
+    // Half of what is free, and how far its middle is to the right of the picture's.
+    let free = 1.0 - f64::from(covered) / f64::from(size[0].max(1));
+    let middle = tan_x * (free - 1.0);
     // Relative to one of the points, for precision.
     let base = points.first().copied().unwrap_or_default();
     // Of an eye at (x, y, back) along the axes, the point at (px, py, pback) is seen if
-    // |px - x| <= tan_x (back - pback), and so for y: four linear bounds.
+    // |px - x - middle (back - pback)| <= tan_x (back - pback), and so for y: four linear bounds.
     let side = |axis: DVec3, tan: f64| {
         let bound = |p: &DVec3| (*p - base).dot(axis) + tan * (*p - base).dot(axes[2]);
         points.iter().map(bound).fold(f64::NEG_INFINITY, f64::max)
     };
-    let (tan_x, tan_y) = (tan_x * FILLED, tan_y * FILLED);
-    let [east, west] = [axes[0], -axes[0]].map(|axis| side(axis, tan_x));
+    let (tan_x, tan_y) = (tan_x * free * FILLED, tan_y * FILLED);
+    let (east, west) = (side(axes[0], tan_x + middle), side(-axes[0], tan_x - middle));
     let [top, bottom] = [axes[1], -axes[1]].map(|axis| side(axis, tan_y));
     let back = ((east + west) / (2.0 * tan_x)).max((top + bottom) / (2.0 * tan_y));
-    let [x, y] = [(east - west) / 2.0, (top - bottom) / 2.0];
+    let [x, y] = [(east - west) / 2.0 - middle * back, (top - bottom) / 2.0];
     let eye = base + axes[0] * x + axes[1] * y + axes[2] * back;
     // Half way into the scene.
     let depth = |p: &DVec3| (eye - *p).dot(axes[2]);
@@ -115,10 +144,6 @@ mod tests {
         [from.dot(right) / depth / tan / aspect, from.dot(up) / depth / tan, depth]
     }
 
-    fn corners([low, high]: [DVec3; 2]) -> [DVec3; 8] {
-        std::array::from_fn(|i| DVec3::select(glam::BVec3::new(i & 1 > 0, i & 2 > 0, i & 4 > 0), high, low))
-    }
-
     #[test]
     fn an_overview_holds_the_box_tightly() {
         let boxes = [
@@ -129,9 +154,14 @@ mod tests {
             [DVec3::new(4e5, 4e6, 100.0), DVec3::new(4.9e5, 4.01e6, 900.0)],
         ];
         for size in [[1380, 768], [400, 900]] {
-            for bounds in boxes {
-                let camera = around_box(bounds, size, 1.0);
+            for (bounds, part) in boxes.into_iter().flat_map(|bounds| [0, 1, 2, 3].map(|part| (bounds, part)))
+            {
+                let room = Room { size, covered: size[0] * part / 5 };
+                let camera = around_box(bounds, &room, 1.0);
+                // In what is free, with 1 at its sides.
+                let free = 1.0 - f64::from(part) / 5.0;
                 let seen = corners(bounds).map(|p| seen(&camera, p));
+                let seen = seen.map(|[x, y, depth]| [(x + 1.0 - free) / free, y, depth]);
                 assert!(seen.iter().all(|s| s[2] > 0.0), "{camera:?}");
                 let most = |i: usize| seen.iter().map(|s| s[i].abs()).fold(0.0, f64::max);
                 let widest = most(0).max(most(1));
@@ -143,7 +173,7 @@ mod tests {
 
     #[test]
     fn a_lone_point_has_an_overview() {
-        let camera = around(&[DVec3::new(5e5, 4e6, 100.0)], [4, 3], 1.0);
+        let camera = around(&[DVec3::new(5e5, 4e6, 100.0)], &Room::whole([4, 3]), 1.0);
         assert!(camera.eye.is_finite() && camera.eye != camera.target, "{camera:?}");
     }
 }

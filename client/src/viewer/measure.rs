@@ -8,6 +8,9 @@ use glam::DVec3;
 /// Places of a profile.
 const SAMPLES: usize = 200;
 
+/// Cells of the finest layer that two places of a profile are apart at least.
+const APART_CELLS: f64 = 0.1;
+
 /// Frames after which a profile is looked at again while data arrives.
 const FRAMES: u32 = 20;
 
@@ -60,6 +63,11 @@ pub(super) fn follow(viewer: &mut Viewer) {
         viewer.profile = Profile::default();
         return;
     };
+    // Of one place there is no profile.
+    if (last.place - first.place).truncate().length() < APART_CELLS * viewer.cell() {
+        viewer.profile = Profile::default();
+        return;
+    }
     let ends = Some([first.place, last.place]);
     let profile = &mut viewer.profile;
     profile.age += 1;
@@ -151,8 +159,10 @@ pub(super) fn show(viewer: &Viewer, ui: &mut Ui) {
             let by = last.place - first.place;
             let (apart, way) = (metres(by.truncate().length()), if by.z < 0.0 { "down" } else { "up" });
             ui.monospace(format!("{apart} m apart on the level, {} m {way}", metres(by.z.abs())));
-            ui.monospace(format!("{} m over the ground", metres(viewer.profile.length())));
-            plot(&viewer.profile, digits, ui);
+            if viewer.profile.ends.is_some() {
+                ui.monospace(format!("{} m over the ground", metres(viewer.profile.length())));
+                plot(&viewer.profile, digits, ui);
+            }
         }
     }
 }
@@ -194,6 +204,10 @@ fn plot(profile: &Profile, digits: usize, ui: &mut Ui) {
     };
     corner(Align2::LEFT_TOP, format!("{} m", metres(high, digits)));
     corner(Align2::LEFT_BOTTOM, format!("{} m", metres(low, digits)));
+    if let Some([first, last]) = profile.ends {
+        let length = (last - first).truncate().length();
+        corner(Align2::RIGHT_BOTTOM, format!("{} m →", metres(length, digits - 1)));
+    }
     if let (Some(pointer), Some([first, last])) = (response.hover_pos(), profile.ends) {
         let part = f64::from(((pointer.x - rect.left()) / rect.width()).clamp(0.0, 1.0));
         #[allow(

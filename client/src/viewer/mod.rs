@@ -3,6 +3,7 @@
 //! | module | what it holds |
 //! |---|---|
 //! | `panel` | sliders, choices, figures, and what was clicked |
+//! | `pivot` | what the view moves around |
 //! | `truth` | the switch that shows nothing but what was measured |
 //! | `time` | the clock of water that changes with time |
 //! | `display` | a window or a canvas, and what draws on it |
@@ -21,6 +22,7 @@ mod boxes;
 pub(crate) mod display;
 mod measure;
 mod panel;
+mod pivot;
 #[cfg(not(target_arch = "wasm32"))]
 mod shelf;
 mod time;
@@ -77,11 +79,20 @@ const MORPH_SECONDS: f64 = 0.3;
 /// Points at the window's lower side that messages take.
 const MESSAGE_POINTS: f32 = 26.0;
 
+/// The width of a window, in points, that has room for the panel beside the ground.
+const NARROW_POINTS: f32 = 500.0;
+
+/// Pixels by which the panel has to change for the view that it lies beside to do so.
+const COVERED_MORE: u32 = 40;
+
 /// Seconds that a message stays.
 const MESSAGE_SECONDS: f64 = 8.0;
 
 /// The longest step of what moves the eye, in seconds: after a frame that took longer it is not far away at once.
-const STEP_SECONDS: f64 = 0.1;
+const STEP_SECONDS: f64 = 0.25;
+
+/// Seconds between two clicks that are one double click, where frames take no time.
+const CLICK_SECONDS: f64 = 0.3;
 
 /// What whoever shows the viewer is asked to do.
 #[derive(Debug, Clone, PartialEq)]
@@ -108,8 +119,11 @@ pub struct Viewer {
     /// The scene's address.
     url: String,
     controls: Controls,
-    /// Whether it has yet to go where it begins, once it is known how much of the picture the panel covers.
+    /// Whether it is where it begins, until it is moved: there all is seen, however large the picture turns out to be,
+    /// and however much of it the panel covers.
     begins: bool,
+    /// The camera that it begins with, as it was set, and how much was covered then.
+    home: Option<(Camera, u32)>,
     picker: Picker,
     look: Look,
     /// What is beautiful and not shown, while nothing but what was measured is.
@@ -125,6 +139,8 @@ pub struct Viewer {
     globe: Option<Globe>,
     bookmarks: Bookmarks,
     panel_is_open: bool,
+    /// Whether somebody said so.
+    panel_is_chosen: bool,
     /// Pixels of the picture's width that the panel covers.
     covered: u32,
     shows_boxes: bool,
@@ -155,6 +171,7 @@ impl Viewer {
         let mut viewer = Self {
             controls: Controls::new(camera),
             begins: view.is_none(),
+            home: None,
             terrain,
             url: url.to_owned(),
             picker: Picker::default(),
@@ -168,6 +185,7 @@ impl Viewer {
             globe,
             bookmarks: Bookmarks::default(),
             panel_is_open: true,
+            panel_is_chosen: false,
             covered: 0,
             shows_boxes: false,
             history: History::default(),
@@ -285,16 +303,20 @@ impl Viewer {
         let seconds = if self.goes_on { since } else { usual.min(STEP_SECONDS) };
         if with_panel {
             let width = ui.available_rect_before_wrap().width();
+            if !self.panel_is_chosen {
+                self.panel_is_open = width >= NARROW_POINTS;
+            }
             panel::show(self, ui);
             let covered = width - ui.available_rect_before_wrap().width();
             #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a part of a width")]
             let covered = (covered * ui.ctx().pixels_per_point()).max(0.0) as u32;
             self.covered = covered;
         }
-        if std::mem::take(&mut self.begins) {
-            self.controls = Controls::new(self.whole(&self.terrain.shown_scene()));
-        }
+        self.begin();
         self.switch_panel(ui);
+        // Frames may take longer than two clicks.
+        let delay = CLICK_SECONDS + since.min(1.0);
+        ui.ctx().options_mut(|options| options.input_options.max_double_click_delay = delay);
         self.steer(ui, seconds.min(STEP_SECONDS));
         self.controls.step(seconds.min(STEP_SECONDS));
         let eye = self.camera().eye;
@@ -304,9 +326,9 @@ impl Viewer {
             self.look.exaggeration,
             eye.truncate(),
         );
-        if let Some(ground) = ground {
-            self.controls.stay_above(ground, CLEARANCE_CELLS * self.cell());
-        }
+        // Beside the ground, where nothing is to be seen from below.
+        let ground = ground.unwrap_or_else(|| self.bounds().min.z);
+        self.controls.stay_above(ground, CLEARANCE_CELLS * self.cell());
         let (reloads, is_replaced) = (self.frame.stats.reloads, self.terrain.scene_changed());
         self.terrain.set_wires(self.look.wireframe);
         self.terrain.set_mirrors(self.look.mirrors().then_some(self.look.water.mirror_error));
@@ -399,14 +421,6 @@ impl Viewer {
         self.picker.pick(&self.terrain.scene().layers, &items, self.look.exaggeration, &ray)
     }
 
-    /// What to move around a place of the picture: the ground there, or a point as far away as the target.
-    fn pivot(&mut self, at: DVec2) -> DVec3 {
-        let hit = self.pick(at);
-        let camera = self.controls.camera();
-        let distance = (camera.target - camera.eye).length();
-        hit.map_or_else(|| camera.eye + controls::ray(camera, at) * distance, |hit| hit.point)
-    }
-
     fn steer(&mut self, ui: &mut Ui, seconds: f64) {
         let scale = f64::from(ui.ctx().pixels_per_point());
         let rect = ui.available_rect_before_wrap();
@@ -418,7 +432,7 @@ impl Viewer {
         if response.drag_started()
             && let Some(origin) = ui.input(|input| input.pointer.press_origin())
         {
-            self.grabbed = Some(self.pivot(pixel(origin)));
+            self.grabbed = Some(self.reach(pixel(origin)));
         }
         if let (Some(grabbed), Some(at)) = (self.grabbed, pointer) {
             let turns = response.dragged_by(PointerButton::Middle)
@@ -438,7 +452,7 @@ impl Viewer {
         // Two fingers: they turn and tilt what is between them; that they spread is a zoom, below.
         if let Some(touch) = ui.input(egui::InputState::multi_touch) {
             let middle = pixel(touch.center_pos);
-            let point = self.pivot(middle);
+            let point = self.pivot(middle).unwrap_or(self.camera().eye);
             let tilt = f64::from(touch.translation_delta.y) * TURN_PER_POINT;
             // The ground turns as the fingers do, so the view the other way.
             self.controls.turn(point, -f64::from(touch.rotation_delta), -tilt);
@@ -448,7 +462,7 @@ impl Viewer {
             let (scroll, pinch) = ui.input(|input| (input.smooth_scroll_delta().y, input.zoom_delta()));
             let factor = (-f64::from(scroll) * ZOOM_PER_POINT).exp() / f64::from(pinch);
             if factor != 1.0 {
-                let point = self.pivot(pixel(at));
+                let point = self.reach(pixel(at));
                 self.controls.zoom(point, factor, nearest);
             }
         }
@@ -482,13 +496,17 @@ impl Viewer {
         if !is_pressed(ui, Key::Tab) {
             return;
         }
-        self.panel_is_open = !self.panel_is_open;
+        self.open_panel(!self.panel_is_open);
         // To egui the key means the next widget.
         ui.memory_mut(|memory| {
             if let Some(focused) = memory.focused() {
                 memory.surrender_focus(focused);
             }
         });
+    }
+
+    fn open_panel(&mut self, opens: bool) {
+        (self.panel_is_open, self.panel_is_chosen) = (opens, true);
     }
 
     fn keys(&mut self, ui: &Ui, seconds: f64) {
@@ -562,18 +580,30 @@ impl Viewer {
         // In a window that is hardly wider than the panel, under it.
         let covered = if 2 * self.covered > size[0] { 0 } else { self.covered };
         let exaggeration = self.look.exaggeration;
-        let free = overview::stretched_overview(scene, [size[0] - covered, size[1]], exaggeration);
-        let camera = Camera { size, ..overview::stretched(&free, exaggeration) };
-        // The middle of the free part is left of the picture's.
-        let pixels = f64::from(covered) / 2.0;
-        let distance = (camera.target - camera.eye).length();
-        let by = camera.axes()[0] * (pixels / camera.pixels_per_radian() * distance);
-        Camera { eye: camera.eye + by, target: camera.target + by, ..camera }
+        overview::stretched(&overview::overview_beside(scene, size, covered, exaggeration), exaggeration)
     }
 
-    /// Turns until north is up, around the middle of the picture.
+    /// Where it begins all is seen, until it is moved.
+    fn begin(&mut self) {
+        if !self.begins {
+            return;
+        }
+        let size = self.camera().size;
+        if let Some((home, covered)) = self.home {
+            self.begins = Camera { size, ..home } == *self.camera() && !self.controls.is_gliding();
+            // The panel is a little wider or narrower now and then.
+            if !self.begins || home.size == size && covered.abs_diff(self.covered) < COVERED_MORE {
+                return;
+            }
+        }
+        let home = self.whole(&self.terrain.shown_scene());
+        self.home = Some((home, self.covered));
+        self.controls = Controls::new(home);
+    }
+
+    /// Turns until north is up, around the middle of the picture; on the spot where that is the sky.
     fn north_up(&mut self) {
-        let pivot = self.pivot(self.middle());
+        let pivot = self.pivot(self.middle()).unwrap_or(self.camera().eye);
         self.controls.glide_north(pivot);
     }
 
@@ -595,7 +625,7 @@ impl Viewer {
     /// The ground in the middle of the picture stays there, and as far away.
     fn set_exaggeration(&mut self, exaggeration: f64) {
         let by = exaggeration / self.look.exaggeration;
-        let ground = self.pivot(self.middle()).z;
+        let ground = self.reach(self.middle()).z;
         self.look.exaggeration = exaggeration;
         self.terrain.set_exaggeration(exaggeration);
         self.controls.lift(ground * (by - 1.0));

@@ -6,7 +6,10 @@ use crate::encoding::Encoding;
 use crate::render::{Background, Colours, Shading};
 use crate::terrain::FrameView;
 use diamantina_protocol::message::Kind;
-use egui::{Checkbox, Color32, ComboBox, Frame, Panel, RichText, ScrollArea, Slider, Stroke, Ui};
+use egui::style::ScrollStyle;
+use egui::{
+    Align2, Area, Checkbox, Color32, ComboBox, Frame, Panel, RichText, ScrollArea, Slider, Stroke, Ui,
+};
 use std::collections::VecDeque;
 
 /// Frames that the plots show.
@@ -59,11 +62,19 @@ impl History {
 pub(super) fn show(viewer: &mut Viewer, ui: &mut Ui) {
     progress(viewer, ui);
     if !viewer.panel_is_open {
+        let corner = Area::new(ui.scope_id().with("open panel")).anchor(Align2::RIGHT_TOP, [-10.0, 10.0]);
+        corner.show(ui.ctx(), |ui| {
+            if ui.button("☰").on_hover_text("The panel: Tab").clicked() {
+                viewer.open_panel(true);
+            }
+        });
         return;
     }
     let fill = ui.visuals().panel_fill.gamma_multiply(0.94);
     let frame = Frame::new().fill(fill).inner_margin(10);
     Panel::right("panel").frame(frame).resizable(true).default_size(270.0).show(ui, |ui| {
+        // Beside the figures, not over them.
+        ui.spacing_mut().scroll = ScrollStyle::solid();
         ScrollArea::vertical().show(ui, |ui| {
             scene(viewer, ui);
             view(viewer, ui);
@@ -88,7 +99,16 @@ pub(super) fn heading(ui: &mut Ui, text: &str) {
 
 fn scene(viewer: &mut Viewer, ui: &mut Ui) {
     let scene = viewer.terrain.scene();
-    ui.heading(&scene.name);
+    let name = scene.name.clone();
+    ui.horizontal(|ui| {
+        ui.heading(name);
+        ui.with_layout(egui::Layout::right_to_left(egui::Align::Center), |ui| {
+            if ui.button("☰").on_hover_text("Hide the panel: Tab").clicked() {
+                viewer.open_panel(false);
+            }
+        });
+    });
+    let scene = viewer.terrain.scene();
     ui.label(RichText::new(format!("version {}", scene.version)).weak().small());
     // Of a series one step stands for all.
     let position = |name: &str| scene.layers.iter().position(|layer| scene.chosen_as(&layer.name) == name);
@@ -197,7 +217,7 @@ fn imagery(viewer: &mut Viewer, ui: &mut Ui) {
     }
     if chosen.is_some() {
         let look = &mut viewer.look.imagery;
-        ui.add(Slider::new(&mut look.opacity, 0.0..=1.0).text("imagery"));
+        ui.add(Slider::new(&mut look.opacity, 0.0..=1.0).text("opacity"));
         ui.add(Slider::new(&mut look.light, 0.0..=1.0).text("light on it"));
     }
 }
@@ -250,11 +270,10 @@ fn water(viewer: &mut Viewer, ui: &mut Ui) {
     ui.add_enabled_ui(water.reflecting && !is_true, |ui| {
         ui.add(Slider::new(&mut water.waves, 0.0..=3.0).text("waves"));
         let mut clarity = water.clarity.unwrap_or_default();
-        let told = if water.clarity.is_some() { "clear to [m]" } else { "clear as fits" };
         let slider = Slider::new(&mut clarity, 0.0..=100.0).logarithmic(true).smallest_positive(0.01);
         if ui
-            .add(slider.text(told))
-            .on_hover_text("a third of the light comes down so deep; 0: as fits")
+            .add(slider.text("clear to [m]"))
+            .on_hover_text("A third of the light comes down so deep; 0: as fits the depths")
             .changed()
         {
             water.clarity = (clarity > 0.0).then_some(clarity);
@@ -352,7 +371,6 @@ fn grouped(number: u64) -> String {
     text
 }
 
-/// Values over time, the newest at the right.
 /// The top of a plot's scale: what nine of ten values are below, and a quarter more. A few that are far larger, as errors
 /// are until the first data are there, would press all others flat; they leave the plot at its top.
 pub(super) fn top(values: &VecDeque<f32>) -> f32 {
@@ -363,6 +381,7 @@ pub(super) fn top(values: &VecDeque<f32>) -> f32 {
     if usual > 0.0 { most.min(1.25 * usual) } else { most }
 }
 
+/// Values over time, the newest at the right.
 fn plot(ui: &mut Ui, name: &str, values: &VecDeque<f32>) {
     let size = egui::vec2(ui.available_width(), 34.0);
     let (rect, _) = ui.allocate_exact_size(size, egui::Sense::hover());

@@ -14,6 +14,8 @@ struct Hand {
     viewer: Viewer,
     context: egui::Context,
     seconds: f64,
+    /// The window's size, in points.
+    points: egui::Vec2,
     served: Served,
 }
 
@@ -36,7 +38,8 @@ impl Hand {
         let terrain =
             Terrain::open(&served.url, Options { fetch: fetch::Options::default(), ..Options::default() });
         let viewer = Viewer::new(terrain.unwrap(), &served.url, look, SIZE, camera.map(view_at));
-        let mut hand = Self { viewer, context: egui::Context::default(), seconds: 0.0, served };
+        let points = vec2(SIZE[0] as f32, SIZE[1] as f32);
+        let mut hand = Self { viewer, context: egui::Context::default(), seconds: 0.0, points, served };
         hand.settle();
         hand
     }
@@ -52,9 +55,8 @@ impl Hand {
 
     fn frame_after(&mut self, seconds: f64, modifiers: Modifiers, events: &[Event]) {
         self.seconds += seconds;
-        let size = SIZE.map(|s| s as f32);
         let input = RawInput {
-            screen_rect: Some(Rect::from_min_size(Pos2::ZERO, vec2(size[0], size[1]))),
+            screen_rect: Some(Rect::from_min_size(Pos2::ZERO, self.points)),
             time: Some(self.seconds),
             predicted_dt: 1.0 / 60.0,
             events: [&[Event::ModifiersChanged(modifiers)], events].concat(),
@@ -462,7 +464,7 @@ fn the_true_view_is_plain_and_can_be_left_again() {
     hand.viewer.set_exaggeration(3.0);
     hand.viewer.terrain.set_morph_seconds(0.3);
     let (before, eye) = (*hand.viewer.look(), hand.camera().eye);
-    let ground = hand.viewer.pivot(hand.viewer.middle());
+    let ground = hand.viewer.reach(hand.viewer.middle());
     assert!(!hand.viewer.is_true());
     hand.viewer.set_true(true);
     let look = *hand.viewer.look();
@@ -483,13 +485,13 @@ fn the_true_view_is_plain_and_can_be_left_again() {
 fn what_is_in_the_middle_stays_there_while_heights_grow() {
     let mut hand = Hand::new(Some(looking_down()));
     let before = hand.camera();
-    let ground = hand.viewer.pivot(hand.viewer.middle());
+    let ground = hand.viewer.reach(hand.viewer.middle());
     hand.viewer.set_exaggeration(4.0);
     let after = hand.camera();
     let drawn = ground.with_z(4.0 * ground.z);
     assert!(((after.eye - drawn) - (before.eye - ground)).length() < 1e-6, "{} {}", before.eye, after.eye);
     hand.settle();
-    let found = hand.viewer.pivot(hand.viewer.middle());
+    let found = hand.viewer.reach(hand.viewer.middle());
     assert!((found - drawn).length() < 0.05 * (after.eye - drawn).length(), "{found} {drawn}");
 }
 
@@ -501,12 +503,8 @@ fn the_whole_scene_lies_beside_the_panel() {
     let camera = hand.camera();
     let scene = hand.viewer.terrain.shown_scene();
     let [low, high] = overview::extent(&scene);
-    for i in 0..4 {
-        let corner = DVec3::new(
-            if i & 1 == 0 { low.x } else { high.x },
-            if i & 2 == 0 { low.y } else { high.y },
-            low.z,
-        );
+    for i in 0..8 {
+        let corner = DVec3::select(glam::BVec3::new(i & 1 > 0, i & 2 > 0, i & 4 > 0), high, low);
         let [at, _] = boxes::seen(&camera, [corner; 2]).unwrap();
         assert!(at.x > 0.0 && at.x < f64::from(SIZE[0] - covered), "{at}");
     }
@@ -518,6 +516,92 @@ fn the_whole_scene_lies_beside_the_panel() {
     hand.settle();
     assert_eq!(hand.viewer.covered, 0);
     assert!((hand.camera().target.x - f64::midpoint(low.x, high.x)).abs() < 1e-6 * (high.x - low.x));
+}
+
+#[test]
+fn a_zoom_beside_the_ground_comes_to_rest_above_it_and_not_through_it() {
+    let mut hand = Hand::new(None);
+    let at = pos2(8.0, 8.0);
+    for towards in [at, pos2(8.0, 690.0)] {
+        hand.key(Key::H, true);
+        hand.settle();
+        assert!(hand.viewer.pick(DVec2::new(towards.x.into(), towards.y.into())).is_none());
+        let bounds = hand.viewer.bounds();
+        let far = bounds.distance(hand.camera().eye);
+        for _ in 0..60 {
+            let (unit, phase) = (egui::MouseWheelUnit::Point, egui::TouchPhase::Move);
+            let (source, modifiers) = (egui::MouseWheelSource::Wheel, Modifiers::NONE);
+            let wheel = Event::MouseWheel { unit, delta: vec2(0.0, 50.0), modifiers, phase, source };
+            hand.frame(&[Event::PointerMoved(towards), wheel]);
+        }
+        let eye = hand.camera().eye;
+        assert!(eye.z > bounds.min.z, "{eye} {bounds:?}");
+        let seen = bounds.max - bounds.min;
+        assert!(bounds.distance(eye) < 4.0 * far.max(seen.length()), "{eye} {bounds:?}");
+    }
+}
+
+#[test]
+fn north_comes_up_on_the_spot_where_the_sky_is_in_the_middle() {
+    let mut hand = Hand::new(Some(looking_down()));
+    let [eye, ahead] = [hand.camera().eye, DVec3::new(1.0, 0.4, 0.3)];
+    hand.viewer.controls = Controls::new(Camera { target: eye + ahead, ..hand.camera() });
+    hand.key(Key::N, true);
+    hand.settle();
+    assert!((hand.camera().eye - eye).length() < 1e-6 && hand.viewer.controls.heading().abs() < 1e-6);
+}
+
+#[test]
+fn what_begins_with_all_of_the_scene_shows_it_in_whatever_size_until_it_is_moved() {
+    let mut hand = Hand::new(None);
+    let home = hand.camera();
+    hand.viewer.resize([640, 700]);
+    hand.frame(&[]);
+    let smaller = hand.viewer.whole(&hand.viewer.terrain.shown_scene());
+    assert!(hand.camera() == smaller && smaller.eye != home.eye);
+    hand.key(Key::E, true);
+    hand.key(Key::E, false);
+    let moved = hand.camera();
+    hand.viewer.resize(SIZE);
+    hand.frame(&[]);
+    assert_eq!(hand.camera().eye, moved.eye);
+}
+
+#[test]
+fn the_panel_has_a_button_and_is_closed_where_there_is_no_room() {
+    let mut hand = Hand::new(Some(looking_down()));
+    assert!(hand.viewer.panel_is_open);
+    // In its upper right corner.
+    hand.click(pos2(972.0, 22.0));
+    assert!(!hand.viewer.panel_is_open);
+    hand.frame(&[]);
+    hand.click(pos2(976.0, 20.0));
+    assert!(hand.viewer.panel_is_open && hand.viewer.marks().is_empty());
+
+    let mut hand = Hand::new(Some(looking_down()));
+    hand.points = vec2(390.0, 700.0);
+    hand.frame(&[]);
+    assert!(!hand.viewer.panel_is_open);
+}
+
+#[test]
+fn of_one_place_there_is_no_profile_and_slow_double_clicks_fly() {
+    let mut hand = Hand::new(Some(looking_down()));
+    let [at, _] = hand.solid();
+    hand.click(at);
+    (0..30).for_each(|_| hand.frame(&[]));
+    hand.click(at);
+    assert_eq!((hand.viewer.marks().len(), hand.viewer.profile.heights().len()), (2, 0));
+    hand.key(Key::Escape, true);
+    (0..30).for_each(|_| hand.frame(&[]));
+    let click = |pressed| {
+        let (button, modifiers) = (PointerButton::Primary, Modifiers::NONE);
+        Event::PointerButton { pos: at, button, pressed, modifiers }
+    };
+    for _ in 0..2 {
+        hand.frame_after(0.7, Modifiers::NONE, &[click(true), click(false)]);
+    }
+    assert!(hand.viewer.controls.is_gliding());
 }
 
 #[test]
@@ -567,7 +651,8 @@ fn a_new_version_is_noticed_while_nothing_is_missing() {
     let fetch = fetch::Options { follow: Some(Duration::from_millis(20)), ..fetch::Options::default() };
     let terrain = Terrain::open(&served.url, Options { fetch, ..Options::default() }).unwrap();
     let viewer = Viewer::new(terrain, &served.url, Look::default(), SIZE, Some(view_at(looking_down())));
-    let mut hand = Hand { viewer, context: egui::Context::default(), seconds: 0.0, served };
+    let points = vec2(SIZE[0] as f32, SIZE[1] as f32);
+    let mut hand = Hand { viewer, context: egui::Context::default(), seconds: 0.0, points, served };
     hand.settle();
     for _ in 0..50 {
         hand.frame(&[]);
