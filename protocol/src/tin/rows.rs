@@ -10,9 +10,10 @@
 //! those beside it: so the classes of a row are known before its first number, and two lanes run through it side by side.
 
 #![allow(
+    clippy::cast_possible_truncation,
     clippy::cast_possible_wrap,
     clippy::cast_sign_loss,
-    reason = "a lattice has fewer than 2^16 points, and columns are within 2^8"
+    reason = "a lattice has fewer than 2^16 points, columns are within 2^8, and means of sizes below 2^27"
 )]
 
 use super::lattice::Row;

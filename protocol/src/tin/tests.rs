@@ -176,7 +176,7 @@ proptest! {
         prop_assert_eq!(bytes[0] & !TWO_LANES, FORMAT << 4 | LATTICE);
         prop_assert_eq!(decode(&forest, d, &bytes).unwrap(), patch.clone());
         let neighbours = Neighbours::of(&patch.triangles, patch.vertices.len());
-        prop_assert_eq!(encode_with(&forest, d, &patch, &neighbours).unwrap(), bytes.clone());
+        prop_assert_eq!(encode_with(&forest, d, &patch, &neighbours).unwrap(), &bytes[..]);
         let mut dice = Dice(seed);
         for child in 0..4 {
             let range = patch.range(child);
