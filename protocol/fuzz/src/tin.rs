@@ -17,7 +17,7 @@ pub fn run(data: &[u8]) {
     let d = diamonds[usize::from(*shape >> 3) % diamonds.len()];
     let mut payload = rest.to_vec();
     if shape & 1 == 0 {
-        payload.insert(0, FORMAT << 4 | (shape >> 1 & 3));
+        payload.insert(0, FORMAT << 4 | shape >> 5 & 4 | shape >> 1 & 3);
     }
     if let Ok(patch) = tin::decode(&forest, d, &payload) {
         assert!(patch.triangles.len() <= TRIANGLES_MAX && patch.vertices.len() <= VERTICES_MAX);

@@ -7,36 +7,42 @@
 //!
 //! A payload tells the mesh in the order of a walk over it that both ends take (`walk`): of each edge what lies
 //! beyond, and of each new vertex how far it is from where the triangle behind the edge lets it expect. So no
-//! index is ever sent, and most of what is sent is small.
+//! index is ever sent, and most of what is sent is small. Of a whole lattice (`lattice`: every point of the square, each
+//! cell cut along the diagonal of the bintree) heights alone are sent, row by row (`rows`).
 //!
 //! | offset | size | field | valid range |
 //! |---|---|---|---|
-//! | 0 | 1 | format, in the high four bits | 1 |
-//! | 0 | | bit 0: some border lies inside of the square; bit 1: two lanes, just where there are as many triangles as [`TWO_LANES_TRIANGLES`] | |
+//! | 0 | 1 | format, in the high four bits | 2 |
+//! | 0 | | bit 0: some border lies inside of the square; bit 1: two lanes, just where there are as many triangles as [`TWO_LANES_TRIANGLES`]; bit 2: a whole lattice, which has no such border | |
 //! | 1 | .. | symbols, see [`crate::rans`] | |
 //!
 //! The symbols are: base-2 logarithm of the unit of x and y (5 plain bits); the first vertex's height; one less than
-//! the unit of heights, which is the largest that divides all differences; the walk. Each bit of the walk has an
-//! adaptive context, and goes in the first lane; all numbers go in the last. A payload without bytes is a patch
-//! without triangles.
+//! the unit of heights, which is the largest that divides all differences; the walk, or the lattice's rows. Each bit of the
+//! walk has an adaptive context, and goes in the first lane; all numbers go in the last, but those of a row, which take
+//! turns. A payload without bytes is a patch without triangles.
 //!
 //! Every payload that decodes encodes to the same bytes again: nothing can be said in two ways.
+//!
+//! History: format 1 told whole lattices by walks, too.
 
+mod lattice;
 mod mesh;
 mod numbers;
 mod regular;
+mod rows;
 mod walk;
 
 use crate::HEIGHT_MAX;
 use crate::bintree::Forest;
 use crate::diamond::Diamond;
 use crate::rans::{Context, Decoder, Encoder};
+use lattice::Lattice;
 use mesh::Mesh;
-use numbers::{Scale, Tables};
-use walk::{Beyond, Fault, Pass, Point, Seed, Square, Walk};
+use numbers::{Class, Scale, Tables};
+use walk::{Beyond, Fault, Pass, Point, Seed, Square, Walk, Wire};
 
 /// The format that this build writes, and the only one that it reads.
-pub const FORMAT: u8 = 1;
+pub const FORMAT: u8 = 2;
 
 /// The most triangles of a patch: a full grid of the largest patches' cells.
 pub const TRIANGLES_MAX: usize = 1 << 16;
@@ -49,6 +55,7 @@ pub const TWO_LANES_TRIANGLES: usize = 512;
 
 const HOLES: u8 = 1;
 const TWO_LANES: u8 = 2;
+const LATTICE: u8 = 4;
 
 /// A vertex of a patch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
@@ -126,7 +133,7 @@ pub enum DecodeError {
         found: u8,
     },
     /// Unknown flags.
-    #[error("patch has flags {found:#x}, expected at most 0x3: fetch it again")]
+    #[error("patch has flags {found:#x}, which no encoder sets: fetch it again")]
     Flags {
         /// The flags found.
         found: u8,
@@ -168,24 +175,42 @@ struct Units {
 
 impl Units {
     /// Sends or receives them.
-    fn pass(self, pass: &mut impl Pass) -> Result<Self, Fault> {
+    fn pass(self, pass: &mut impl Wire) -> Result<Self, Fault> {
         let shift = pass.plain(self.shift, 5);
         let base = pass.number(&mut Scale::expecting(1024), self.base)?;
         let step = 1 + pass.number(&mut Scale::expecting(1), self.step - 1)?;
         Ok(Self { shift, base, step })
+    }
+
+    /// The height of a vertex, told in units from the first one's.
+    #[inline]
+    fn height(&self, vertex: usize, told: i32) -> Result<i32, DecodeError> {
+        let height = self.base + self.step * i64::from(told);
+        if (vertex == 0 && told != 0) || height.abs() > i64::from(HEIGHT_MAX) {
+            return Err(DecodeError::Height);
+        }
+        i32::try_from(height).map_err(|_| DecodeError::Height)
+    }
+
+    /// Whether the unit of heights is as large as can be, given what divides all heights told in it.
+    fn is_largest(&self, divisor: i64) -> bool {
+        divisor == 1 || (divisor == 0 && self.step == 1)
     }
 }
 
 /// The bytes of a patch. They depend on the patch alone: on the order of its triangles, but not on that of its vertices.
 ///
 /// What comes back has the same triangles in another order, each child triangle's together, in an order that caches
-/// like; vertices in the order in which triangles use them, without those that none does; and one vertex for
-/// each fan of triangles where fans meet in a point alone.
+/// like; vertices in the order in which triangles use them (of a whole lattice row by row), without those that none does; and
+/// one vertex for each fan of triangles where fans meet in a point alone.
 ///
 /// # Errors
 /// When it is no patch of this diamond.
 pub fn encode(forest: &Forest, d: Diamond, patch: &Patch) -> Result<Vec<u8>, PatchError> {
-    encode_with(forest, d, patch, &Neighbours::of(&patch.triangles, patch.vertices.len()))
+    match lattice::of(forest, d, patch) {
+        Some((lattice, heights)) => encode_lattice(&lattice, heights),
+        None => encode_mesh(forest, d, patch, &Neighbours::of(&patch.triangles, patch.vertices.len())),
+    }
 }
 
 /// Which triangles of a patch have an edge in common. Takes 16 bytes a triangle.
@@ -221,6 +246,66 @@ impl Neighbours {
 /// # Panics
 /// If the neighbours are those of a patch with fewer triangles.
 pub fn encode_with(
+    forest: &Forest,
+    d: Diamond,
+    patch: &Patch,
+    neighbours: &Neighbours,
+) -> Result<Vec<u8>, PatchError> {
+    match lattice::of(forest, d, patch) {
+        Some((lattice, heights)) => encode_lattice(&lattice, heights),
+        None => encode_mesh(forest, d, patch, neighbours),
+    }
+}
+
+/// A whole lattice, given its heights row by row.
+fn encode_lattice(lattice: &Lattice, mut heights: Vec<i32>) -> Result<Vec<u8>, PatchError> {
+    if let Some(height) = heights.iter().find(|h| h.unsigned_abs() > HEIGHT_MAX.unsigned_abs()) {
+        return Err(PatchError::Height(*height));
+    }
+    let first = heights.first().copied().unwrap_or(0);
+    heights.iter_mut().for_each(|height| *height -= first);
+    let step = divisor(&heights).max(1);
+    if step > 1 {
+        heights.iter_mut().for_each(|height| *height /= step);
+    }
+    let lanes = lanes(lattice.triangles());
+    // A table's symbol, and often the bits below it.
+    let coder = Encoder::with_capacity(2 * heights.len() + 16);
+    let mut sender = Sender { coder, tables: numbers::tables(), mesh: () };
+    let units = Units { shift: lattice.shift(), base: first.into(), step: step.into() };
+    let passed = units.pass(&mut sender).and_then(|_| rows::pass(lattice.rows(), &mut heights, &mut sender));
+    // Heights are in range, so this end finds no fault.
+    passed.map_err(|_| PatchError::Overlap)?;
+    Ok(with_header(LATTICE, sender.coder, lanes))
+}
+
+/// The bytes behind their header.
+fn with_header(flags: u8, coder: Encoder, lanes: usize) -> Vec<u8> {
+    let mut bytes = coder.finish(lanes);
+    bytes.insert(0, FORMAT << 4 | flags | if lanes == 2 { TWO_LANES } else { 0 });
+    bytes
+}
+
+/// How many lanes the payload of so many triangles has.
+fn lanes(triangles: usize) -> usize {
+    if triangles >= TWO_LANES_TRIANGLES { 2 } else { 1 }
+}
+
+/// The largest number that divides all heights; 0 if none is anything else.
+fn divisor(heights: &[i32]) -> i32 {
+    let mut divisor = 0;
+    for height in heights {
+        divisor = gcd(divisor, i64::from(*height));
+        // Nothing divides it further.
+        if divisor == 1 {
+            break;
+        }
+    }
+    i32::try_from(divisor).unwrap_or(1)
+}
+
+/// [`encode_with`] of what is no whole lattice.
+fn encode_mesh(
     forest: &Forest,
     d: Diamond,
     patch: &Patch,
@@ -274,11 +359,7 @@ pub fn encode_with(
     let mut sender = Sender { coder, tables: numbers::tables(), mesh };
     let passed = units.pass(&mut sender).and_then(|_| Walk::new(square, holes, expected).run(&mut sender));
     passed.map_err(|fault| if fault == Fault::Size { PatchError::Vertices } else { PatchError::Overlap })?;
-    let two_lanes = patch.triangles.len() >= TWO_LANES_TRIANGLES;
-    let flags = if holes { HOLES } else { 0 } | if two_lanes { TWO_LANES } else { 0 };
-    let mut bytes = sender.coder.finish(if two_lanes { 2 } else { 1 });
-    bytes.insert(0, FORMAT << 4 | flags);
-    Ok(bytes)
+    Ok(with_header(if holes { HOLES } else { 0 }, sender.coder, lanes(expected)))
 }
 
 /// The patch of a diamond. The bytes may be hostile: whatever is returned has no more than [`TRIANGLES_MAX`]
@@ -295,32 +376,54 @@ pub fn decode(forest: &Forest, d: Diamond, bytes: &[u8]) -> Result<Patch, Decode
     if format != FORMAT {
         return Err(DecodeError::Format { found: format });
     }
-    if flags > HOLES | TWO_LANES {
+    if flags > LATTICE | TWO_LANES || flags & (LATTICE | HOLES) == LATTICE | HOLES {
         return Err(DecodeError::Flags { found: flags });
     }
-    let lanes = if flags & TWO_LANES == 0 { 1 } else { 2 };
-    let coder = Decoder::new(symbols, lanes).ok_or(DecodeError::Symbols)?;
-    let found = if lanes == 1 {
+    let coder =
+        Decoder::new(symbols, if flags & TWO_LANES == 0 { 1 } else { 2 }).ok_or(DecodeError::Symbols)?;
+    let patch = if coder.lanes() == 1 {
         receive(forest, d, Receiver::<0> { coder, tables: numbers::tables() }, flags, bytes.len())
     } else {
         receive(forest, d, Receiver::<1> { coder, tables: numbers::tables() }, flags, bytes.len())
-    };
-    let (walk, units) = found?;
-    if (walk.triangles().len() >= TWO_LANES_TRIANGLES) != (lanes == 2) {
-        return Err(DecodeError::Symbols);
-    }
-    gather(&walk, units, d)
+    }?;
+    let has_its_lanes = lanes(patch.triangles.len()) == coder.lanes();
+    // A whole lattice is told as one.
+    let is_told_well = flags & LATTICE != 0 || lattice::of(forest, d, &patch).is_none();
+    if has_its_lanes && is_told_well { Ok(patch) } else { Err(DecodeError::Symbols) }
 }
 
-/// Walks over a mesh as it comes in; numbers are in the lane.
+/// A whole lattice.
+fn receive_lattice<const LANE: usize>(
+    forest: &Forest,
+    d: Diamond,
+    units: Units,
+    mut receiver: Receiver<'_, LANE>,
+) -> Result<Patch, DecodeError> {
+    let lattice = Lattice::new(forest, d, units.shift).ok_or(DecodeError::Symbols)?;
+    let mut heights = vec![0; lattice.points()];
+    rows::pass(lattice.rows(), &mut heights, &mut receiver)?;
+    let divisor = i64::from(divisor(&heights));
+    if !receiver.coder.is_spent() || !units.is_largest(divisor) {
+        return Err(DecodeError::Symbols);
+    }
+    for (i, height) in heights.iter_mut().enumerate() {
+        *height = units.height(i, *height)?;
+    }
+    Ok(lattice.patch(&heights))
+}
+
+/// The patch that comes in; numbers are in the lane.
 fn receive<const LANE: usize>(
     forest: &Forest,
     d: Diamond,
     mut receiver: Receiver<'_, LANE>,
     flags: u8,
     bytes: usize,
-) -> Result<(Walk, Units), DecodeError> {
+) -> Result<Patch, DecodeError> {
     let units = Units { shift: 0, base: 0, step: 1 }.pass(&mut receiver)?;
+    if flags & LATTICE != 0 {
+        return receive_lattice(forest, d, units, receiver);
+    }
     let square = Square::new(forest, d, units.shift);
     if square.is_empty() || units.step < 1 {
         return Err(DecodeError::Symbols);
@@ -328,7 +431,7 @@ fn receive<const LANE: usize>(
     // More are found at less than four bits each.
     let mut walk = Walk::new(square, flags & HOLES != 0, 2 * bytes);
     walk.run(&mut receiver)?;
-    if receiver.coder.is_spent() { Ok((walk, units)) } else { Err(DecodeError::Symbols) }
+    if receiver.coder.is_spent() { gather(&walk, units, d) } else { Err(DecodeError::Symbols) }
 }
 
 /// The patch that a walk has found, if its units are as large as can be.
@@ -341,20 +444,16 @@ fn gather(walk: &Walk, units: Units, d: Diamond) -> Result<Patch, DecodeError> {
         if divisor != 1 {
             divisor = gcd(divisor, i64::from(point.height));
         }
-        let height = units.base + units.step * i64::from(point.height);
-        if (i == 0 && point.height != 0) || height.abs() > i64::from(HEIGHT_MAX) {
-            return Err(DecodeError::Height);
-        }
         let place = |middle: i64, away: i32| {
             u32::try_from(middle + (i64::from(away) << units.shift)).map_err(|_| DecodeError::Place)
         };
         vertices.push(Vertex {
             x: place(centre[0], point.x)?,
             y: place(centre[1], point.y)?,
-            height: i32::try_from(height).map_err(|_| DecodeError::Height)?,
+            height: units.height(i, point.height)?,
         });
     }
-    if odd & 1 == 0 || (divisor != 1 && (divisor != 0 || units.step != 1)) {
+    if odd & 1 == 0 || !units.is_largest(divisor) {
         return Err(DecodeError::Symbols);
     }
     let counts = walk.counts();
@@ -380,10 +479,11 @@ fn gcd(a: i64, b: i64) -> i64 {
     a
 }
 
-struct Sender<'a> {
+/// With the mesh that a walk goes over.
+struct Sender<M> {
     coder: Encoder,
     tables: &'static Tables,
-    mesh: Mesh<'a>,
+    mesh: M,
 }
 
 /// Of numbers in the lane; bits are in the first.
@@ -392,12 +492,7 @@ struct Receiver<'a, const LANE: usize> {
     tables: &'static Tables,
 }
 
-impl Pass for Sender<'_> {
-    #[inline]
-    fn bit(&mut self, context: &mut Context, bit: bool) -> bool {
-        self.coder.bit(context, bit);
-        bit
-    }
+impl<M> Wire for Sender<M> {
     #[inline]
     fn number(&mut self, scale: &mut Scale, number: i64) -> Result<i64, Fault> {
         numbers::encode(&mut self.coder, 1, self.tables, scale, number);
@@ -406,6 +501,14 @@ impl Pass for Sender<'_> {
     fn plain(&mut self, value: u32, bits: u32) -> u32 {
         numbers::plain(&mut self.coder, 1, value, bits);
         value
+    }
+}
+
+impl Pass for Sender<Mesh<'_>> {
+    #[inline]
+    fn bit(&mut self, context: &mut Context, bit: bool) -> bool {
+        self.coder.bit(context, bit);
+        bit
     }
     fn seed(&mut self) -> Option<Seed> {
         self.mesh.seed()
@@ -420,17 +523,57 @@ impl Pass for Sender<'_> {
     }
 }
 
-impl<const LANE: usize> Pass for Receiver<'_, LANE> {
-    #[inline(always)]
-    fn bit(&mut self, context: &mut Context, _: bool) -> bool {
-        self.coder.bit(context)
+impl rows::End for Sender<()> {
+    const SENDS: bool = true;
+    #[inline]
+    fn row(&mut self, classes: &[Class], numbers: &mut [i32]) -> Result<(), Fault> {
+        for (i, (class, number)) in classes.iter().zip(numbers).enumerate() {
+            let lane = if i & 1 == 0 { 0 } else { 1 };
+            numbers::encode_as(&mut self.coder, lane, self.tables, *class, i64::from(*number));
+        }
+        Ok(())
     }
+}
+
+impl<const LANE: usize> Wire for Receiver<'_, LANE> {
     #[inline(always)]
     fn number(&mut self, scale: &mut Scale, _: i64) -> Result<i64, Fault> {
         numbers::decode::<LANE>(&mut self.coder, self.tables, scale).ok_or(Fault::Symbols)
     }
     fn plain(&mut self, _: u32, bits: u32) -> u32 {
         numbers::read_plain::<LANE>(&mut self.coder, bits)
+    }
+}
+
+impl<const LANE: usize> Receiver<'_, LANE> {
+    /// The next number in one of the lanes.
+    #[inline(always)]
+    fn next<const ITS: usize>(&mut self, class: Class) -> Result<i32, Fault> {
+        let number = numbers::decode_as::<ITS>(&mut self.coder, self.tables, class);
+        number.and_then(|number| i32::try_from(number).ok()).ok_or(Fault::Symbols)
+    }
+}
+
+impl<const LANE: usize> rows::End for Receiver<'_, LANE> {
+    const SENDS: bool = false;
+    #[inline]
+    fn row(&mut self, classes: &[Class], numbers: &mut [i32]) -> Result<(), Fault> {
+        let (numbers, last) = numbers.as_chunks_mut::<2>();
+        let (classes, last_class) = classes.as_chunks::<2>();
+        for (pair, class) in numbers.iter_mut().zip(classes) {
+            *pair = [self.next::<0>(class[0])?, self.next::<LANE>(class[1])?];
+        }
+        for (number, class) in last.iter_mut().zip(last_class) {
+            *number = self.next::<0>(*class)?;
+        }
+        Ok(())
+    }
+}
+
+impl<const LANE: usize> Pass for Receiver<'_, LANE> {
+    #[inline(always)]
+    fn bit(&mut self, context: &mut Context, _: bool) -> bool {
+        self.coder.bit(context)
     }
     fn seed(&mut self) -> Option<Seed> {
         None

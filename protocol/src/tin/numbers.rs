@@ -40,14 +40,9 @@ impl Scale {
         Self { mean: magnitude.clamp(1, LEARNT_MAX as u32) << 8 }
     }
 
-    /// The table, and the low bits that go plainly.
     #[inline]
-    fn table(self) -> (usize, u32) {
-        let sixteenths = (self.mean >> 4).max(1);
-        let octave = sixteenths.ilog2();
-        let half = if octave == 0 { 0 } else { sixteenths >> (octave - 1) & 1 };
-        let own = octave.min(OCTAVES);
-        ((2 * own + half) as usize, octave - octave.min(OCTAVES - 1))
+    fn class(self) -> Class {
+        Class::of(self.mean >> 4)
     }
 
     #[inline]
@@ -55,6 +50,26 @@ impl Scale {
         let magnitude = number.abs().min(LEARNT_MAX) as u32;
         // The 15 parts are rounded down: otherwise a mean of less than 16 would never fall.
         self.mean = self.mean - self.mean.div_ceil(16) + (magnitude << 4);
+    }
+}
+
+/// The table under which a number goes, and how many of its low bits go plainly.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Class {
+    table: u8,
+    low: u8,
+}
+
+impl Class {
+    /// Of numbers with a mean magnitude in sixteenths.
+    #[inline]
+    pub(super) fn of(sixteenths: u32) -> Self {
+        let sixteenths = sixteenths.max(1);
+        let octave = sixteenths.ilog2();
+        // Of the least octave there is no upper half.
+        let half = (2 * sixteenths) >> octave & 1;
+        let own = octave.min(OCTAVES);
+        Self { table: (2 * own + half) as u8, low: (octave - octave.min(OCTAVES - 1)) as u8 }
     }
 }
 
@@ -141,8 +156,15 @@ fn table(class: usize) -> Table {
 /// Appends a number of magnitude below 2^30.
 #[inline]
 pub(super) fn encode(coder: &mut Encoder, lane: u8, tables: &Tables, scale: &mut Scale, number: i64) {
-    let (class, low) = scale.table();
-    let table = &tables[class];
+    encode_as(coder, lane, tables, scale.class(), number);
+    scale.learn(number);
+}
+
+/// [`encode`] under a class that is known.
+#[inline]
+pub(super) fn encode_as(coder: &mut Encoder, lane: u8, tables: &Tables, class: Class, number: i64) {
+    let low = u32::from(class.low);
+    let table = &tables[usize::from(class.table)];
     let high = number >> low;
     let symbol = if high.abs() <= DIRECT { (high + DIRECT + 1) as usize } else { 0 };
     let (start, share) = table.range[symbol];
@@ -158,7 +180,6 @@ pub(super) fn encode(coder: &mut Encoder, lane: u8, tables: &Tables, scale: &mut
     if low > 0 {
         plain(coder, lane, (number - (high << low)) as u32, low);
     }
-    scale.learn(number);
 }
 
 /// Appends up to 32 plain bits.
@@ -190,8 +211,20 @@ pub(super) fn decode<const LANE: usize>(
     tables: &Tables,
     scale: &mut Scale,
 ) -> Option<i64> {
-    let (class, low) = scale.table();
-    let table = &tables[class % TABLES];
+    let number = decode_as::<LANE>(coder, tables, scale.class())?;
+    scale.learn(number);
+    Some(number)
+}
+
+/// [`decode`] under a class that is known.
+#[inline(always)]
+pub(super) fn decode_as<const LANE: usize>(
+    coder: &mut Decoder<'_>,
+    tables: &Tables,
+    class: Class,
+) -> Option<i64> {
+    let low = u32::from(class.low);
+    let table = &tables[usize::from(class.table) % TABLES];
     let state = coder.state(LANE);
     let slot = state % TOTAL;
     let symbol = usize::from(table.symbol[slot as usize]) % SYMBOLS;
@@ -200,7 +233,6 @@ pub(super) fn decode<const LANE: usize>(
     coder.set_state(LANE, state);
     let high = if symbol == 0 { escaped::<LANE>(coder) } else { symbol as i64 - DIRECT - 1 };
     let number = (high << low) + if low > 0 { i64::from(read_plain::<LANE>(coder, low)) } else { 0 };
-    scale.learn(number);
     (number.abs() < NUMBER_MAX).then_some(number)
 }
 

@@ -141,13 +141,107 @@ proptest! {
     }
 
     #[test]
-    fn any_bytes_are_a_patch_or_an_error(forest in any_forest(), seed in any::<u64>(), flags in 0u8..4, mut bytes in prop::collection::vec(any::<u8>(), 0..600)) {
+    fn any_bytes_are_a_patch_or_an_error(forest in any_forest(), seed in any::<u64>(), flags in 0u8..8, mut bytes in prop::collection::vec(any::<u8>(), 0..600)) {
         let d = pick(&forest, &mut Dice(seed));
         bytes.insert(0, FORMAT << 4 | flags);
         if let Ok(patch) = decode(&forest, d, &bytes) {
             prop_assert_eq!(encode(&forest, d, &patch), Ok(bytes));
         }
     }
+}
+
+/// The whole lattice of some diamond in steps of 2^shift, with its forest.
+fn any_lattice() -> impl Strategy<Value = (Forest, Diamond, Patch)> {
+    let heights = (any::<u64>(), 1usize..6000, 1i32..5);
+    (3u8..=5, 0u8..=2, 1u32..=2, heights).prop_map(|(side, shift, columns, (seed, relief, step))| {
+        let mut dice = Dice(seed);
+        let [forest, large] = [side, side + shift].map(|log2| Forest::new(log2, 2, [columns, 1]).unwrap());
+        let d = pick(&forest, &mut dice);
+        let height = |_| (dice.below(relief) as i32 - 1000) * step;
+        let (mut patch, _) = Patch::lattice(&forest, d, height).unwrap();
+        for v in &mut patch.vertices {
+            (v.x, v.y) = (v.x << shift, v.y << shift);
+        }
+        (large, large.diamond(d.centre().map(|w| w << shift)).unwrap(), patch)
+    })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(300))]
+
+    #[test]
+    fn whole_lattices_come_back_whatever_their_order(case in any_lattice(), seed in any::<u64>()) {
+        let (forest, d, mut patch) = case;
+        let bytes = encode(&forest, d, &patch).unwrap();
+        prop_assert_eq!(bytes[0] & !TWO_LANES, FORMAT << 4 | LATTICE);
+        prop_assert_eq!(decode(&forest, d, &bytes).unwrap(), patch.clone());
+        let neighbours = Neighbours::of(&patch.triangles, patch.vertices.len());
+        prop_assert_eq!(encode_with(&forest, d, &patch, &neighbours).unwrap(), &bytes[..]);
+        let mut dice = Dice(seed);
+        for child in 0..4 {
+            let range = patch.range(child);
+            let triangles = &mut patch.triangles[range];
+            for i in 1..triangles.len() {
+                triangles.swap(i, dice.below(i + 1));
+                triangles[i].rotate_left(dice.below(3));
+            }
+        }
+        prop_assert_eq!(encode(&forest, d, &patch), Ok(bytes));
+    }
+
+    /// A corner torn off, or a triangle there twice in the place of another: the walk tells it, or refuses it.
+    #[test]
+    fn what_is_nearly_a_lattice_is_none(case in any_lattice(), seed in any::<u64>(), tears: bool) {
+        let (forest, d, mut patch) = case;
+        let mut dice = Dice(seed);
+        let at = dice.below(patch.triangles.len());
+        if tears {
+            let corner = &mut patch.triangles[at][dice.below(3)];
+            patch.vertices.push(patch.vertices[*corner as usize]);
+            *corner = patch.vertices.len() as u32 - 1;
+            if let Ok(bytes) = encode(&forest, d, &patch) {
+                let back = decode(&forest, d, &bytes).unwrap();
+                prop_assert_eq!(bytes[0] & LATTICE, 0);
+                prop_assert_eq!(shapes(&back), shapes(&patch));
+                prop_assert_eq!(encode(&forest, d, &back), Ok(bytes));
+            }
+        } else {
+            let other = if at == 0 { 1 } else { at - 1 };
+            patch.triangles[at] = patch.triangles[other];
+            prop_assert!(encode(&forest, d, &patch).is_err());
+        }
+    }
+
+    #[test]
+    fn bytes_of_lattices_with_a_change_are_refused_or_are_another_patch(case in any_lattice(), flips in prop::collection::vec((any::<u16>(), 0u8..8), 1..4)) {
+        let (forest, d, patch) = case;
+        let mut bytes = encode(&forest, d, &patch).unwrap();
+        for (at, bit) in flips {
+            let at = usize::from(at) % bytes.len();
+            bytes[at] ^= 1 << bit;
+        }
+        if let Ok(patch) = decode(&forest, d, &bytes) {
+            prop_assert_eq!(encode(&forest, d, &patch), Ok(bytes));
+        }
+    }
+
+    #[test]
+    fn neighbours_in_a_lattice_are_those_of_its_triangles(forest in any_forest(), seed in any::<u64>()) {
+        let d = pick(&forest, &mut Dice(seed));
+        let (patch, neighbours) = Patch::lattice(&forest, d, |[x, y]| (x + y) as i32).unwrap();
+        prop_assert_eq!(neighbours, Neighbours::of(&patch.triangles, patch.vertices.len()));
+        prop_assert_eq!(area(&patch) / patch.triangles.len() as i64, 1);
+    }
+}
+
+/// Nothing can be said in two ways.
+#[test]
+fn a_whole_lattice_told_by_a_walk_is_refused() {
+    let (forest, d, patch) = sample();
+    let neighbours = Neighbours::of(&patch.triangles, patch.vertices.len());
+    let bytes = encode_mesh(&forest, d, &patch, &neighbours).unwrap();
+    assert_eq!(bytes[0] & LATTICE, 0);
+    assert_eq!(decode(&forest, d, &bytes), Err(DecodeError::Symbols));
 }
 
 /// Walks wherever chance leads, and writes down what it would have been told.
@@ -162,14 +256,7 @@ struct Rambler {
     coder: Encoder,
 }
 
-impl Pass for Rambler {
-    fn bit(&mut self, context: &mut Context, _: bool) -> bool {
-        // There is something, and an end to it.
-        self.bits += 1;
-        let bit = self.bits == 1 || self.dice.below(8) < self.chance;
-        self.coder.bit(context, bit);
-        bit
-    }
+impl Wire for Rambler {
     fn number(&mut self, scale: &mut Scale, _: i64) -> Result<i64, Fault> {
         // The first vertex has the height that others are told from.
         self.numbers += 1;
@@ -182,6 +269,16 @@ impl Pass for Rambler {
         let value = self.dice.below(1 << bits.min(5)) as u32;
         numbers::plain(&mut self.coder, 1, value, bits);
         value
+    }
+}
+
+impl Pass for Rambler {
+    fn bit(&mut self, context: &mut Context, _: bool) -> bool {
+        // There is something, and an end to it.
+        self.bits += 1;
+        let bit = self.bits == 1 || self.dice.below(8) < self.chance;
+        self.coder.bit(context, bit);
+        bit
     }
     fn seed(&mut self) -> Option<Seed> {
         // The bit that follows says whether there is another part.
@@ -246,7 +343,7 @@ fn sample() -> (Forest, Diamond, Patch) {
 }
 
 #[test]
-fn golden_bytes_of_format_1() {
+fn golden_bytes_of_format_2() {
     let forest = Forest::new(3, 2, [1, 1]).unwrap();
     let d = forest.root_diamonds().next().unwrap();
     let patch = Patch::regular(&forest, d, 1, |[x, y]| Some((10 * x + y) as i32));
@@ -255,7 +352,20 @@ fn golden_bytes_of_format_1() {
     assert_eq!(decode(&forest, d, &bytes).unwrap().vertices.len(), 5);
 }
 
-const GOLDEN: [u8; 13] = [16, 130, 182, 29, 0, 77, 201, 169, 95, 175, 72, 103, 31];
+#[test]
+fn golden_bytes_of_a_whole_lattice() {
+    let forest = Forest::new(3, 2, [1, 1]).unwrap();
+    let d = forest.diamonds(1).next().unwrap();
+    let (patch, _) = Patch::lattice(&forest, d, |[x, y]| (10 * x * y + x) as i32).unwrap();
+    let bytes = encode(&forest, d, &patch).unwrap();
+    assert_eq!(bytes, GOLDEN_LATTICE);
+    assert_eq!(decode(&forest, d, &bytes), Ok(patch));
+}
+
+const GOLDEN_LATTICE: [u8; 23] =
+    [36, 64, 57, 59, 109, 76, 151, 79, 116, 174, 9, 220, 127, 235, 95, 241, 159, 94, 203, 106, 46, 102, 178];
+
+const GOLDEN: [u8; 13] = [32, 130, 182, 29, 0, 77, 201, 169, 95, 175, 72, 103, 31];
 
 #[test]
 fn no_triangles_are_no_bytes() {
@@ -284,6 +394,8 @@ fn damaged_payloads_are_refused() {
     assert_eq!(with(9 << 4), Err(DecodeError::Format { found: 9 }));
     assert_eq!(with(FORMAT << 4 | 12), Err(DecodeError::Flags { found: 12 }));
     assert!(with(FORMAT << 4 | HOLES).is_err() && with(FORMAT << 4 | TWO_LANES).is_err());
+    assert_eq!(with(FORMAT << 4 | LATTICE | HOLES), Err(DecodeError::Flags { found: LATTICE | HOLES }));
+    assert_eq!(with(1 << 4), Err(DecodeError::Format { found: 1 }));
 }
 
 #[test]

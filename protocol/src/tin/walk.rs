@@ -40,13 +40,17 @@ const ANGLES: usize = 6;
 const LENGTHS: usize = 25;
 
 /// The two ends of the wire.
-pub(super) trait Pass {
-    /// A bit under a context: a sender's goes out and comes back.
-    fn bit(&mut self, context: &mut Context, bit: bool) -> bool;
-    /// Likewise a number.
+pub(super) trait Wire {
+    /// A number: a sender's goes out and comes back.
     fn number(&mut self, scale: &mut Scale, number: i64) -> Result<i64, Fault>;
     /// Likewise some bits as they are.
     fn plain(&mut self, value: u32, bits: u32) -> u32;
+}
+
+/// The two ends of the walk.
+pub(super) trait Pass: Wire {
+    /// A bit under a context: a sender's goes out and comes back.
+    fn bit(&mut self, context: &mut Context, bit: bool) -> bool;
     /// A sender's next triangle that the walk cannot reach.
     fn seed(&mut self) -> Option<Seed>;
     /// What a sender's mesh has beyond a gate, by the gate's mark.
@@ -119,6 +123,11 @@ impl Square {
             half: half >> shift,
             upper: local.upper,
         }
+    }
+
+    /// The same, three times as large: in it lies three times what lies in this one.
+    pub(super) fn thrice(self) -> Self {
+        Self { half: 3 * self.half, ..self }
     }
 
     /// Whether units are so large that nothing is left of it.

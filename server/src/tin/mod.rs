@@ -29,7 +29,7 @@ mod state;
 
 pub use collapse::Until;
 pub use ground::Ground;
-pub use patch::{Border, Merged, Simplified, Tin, half_of, merge, simplify, source};
+pub use patch::{Border, Merged, Simplified, Tin, half_of, lattice, merge, simplify, source};
 
 use diamantina_protocol::tin::Vertex;
 use serde::{Deserialize, Serialize};

@@ -8,7 +8,8 @@
 //! halves of its children ─► merge ─► payload ─► simplify ─► two halves, and how far they are from every sample
 //! ```
 //!
-//! The finest payloads are of triangles that were simplified as well, as far as the error asked of the layer allows:
+//! The finest payloads are of triangles that were simplified as well, as far as the error asked of the layer allows (without
+//! loss, of the source's own mesh where hardly anything is flat):
 //! of the levels below them nothing is kept, a tile makes what it needs of them.
 //!
 //! Memory: a tile's samples and the meshes of one diamond a worker, [`WINDOW_SAMPLES`] at most, unless an error is to

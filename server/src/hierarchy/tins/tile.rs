@@ -9,7 +9,7 @@ use crate::hierarchy::BuildError;
 use crate::hierarchy::journal::{Tile, Triangulated};
 use crate::hierarchy::levels::blob_order;
 use crate::store::{Key, Kind as BlobKind};
-use crate::tin::{Ground, Merged, Simplified, Tin, Until, half_of, merge, simplify, source};
+use crate::tin::{Ground, Merged, Simplified, Tin, Until, half_of, lattice, merge, simplify, source};
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::message::PAYLOAD_BYTES_MAX;
@@ -26,8 +26,14 @@ pub(in crate::hierarchy) const BEHIND: u64 = 1 << 63;
 /// Where a tile's input lies.
 pub(super) type Input<'a> = (&'a Halves, &'a (dyn Fn(Diamond) -> Place + Sync));
 
-/// The halves of diamonds below the finest payloads, and how far they are from the source.
-type Finest = HashMap<Diamond, (Simplified, f64)>;
+/// What has been made of diamonds below the finest payloads.
+#[derive(Default)]
+struct Finest {
+    /// Their halves, and how far these are from the source.
+    halves: HashMap<Diamond, (Simplified, f64)>,
+    /// Whether the source's own mesh is left as it is.
+    keep: HashMap<Diamond, bool>,
+}
 
 /// The rectangle around some boxes.
 fn around(boxes: impl Iterator<Item = [[u32; 2]; 2]>) -> Option<[[u32; 2]; 2]> {
@@ -77,7 +83,7 @@ impl Tins<'_> {
         } else {
             None
         };
-        let mut finest = Finest::new();
+        let mut finest = Finest::default();
         for d in diamonds {
             if self.work.progress.is_out_of_patience() {
                 return Err(self.work.interrupted());
@@ -98,7 +104,7 @@ impl Tins<'_> {
             };
             tile.done.push(self.diamond(*d, &mut merged, window.as_ref(), output)?);
         }
-        for (simplified, vertical) in finest.values() {
+        for (simplified, vertical) in finest.halves.values() {
             tile.finest = [tile.finest[0].max(*vertical), tile.finest[1].max(simplified.apart)];
         }
         Ok(tile)
@@ -173,15 +179,18 @@ impl Tins<'_> {
     fn of_finest(&self, deep: &Forest, d: Diamond, ground: Ground<'_>, finest: &mut Finest) -> Merged {
         let until = self.finest_limit(ground);
         let loses = matches!(until, Until::Error { vertical, .. } if vertical > 0.0);
+        if !loses && let Some(lattice) = lattice(deep, d, ground, &self.rules(), &mut finest.keep) {
+            return lattice;
+        }
         let children = deep.children(d);
         for c in children.into_iter().flatten() {
-            if finest.contains_key(&c) {
+            if finest.halves.contains_key(&c) {
                 continue;
             }
             let merged = if loses { self.of_finer(deep, c, ground, finest) } else { source(deep, c, ground) };
             let simplified = simplify(deep, c, &merged, &self.rules(), until);
             let vertical = simplified.vertical.unwrap_or_else(|| distance(&simplified.halves, ground));
-            finest.insert(c, (simplified, vertical));
+            finest.halves.insert(c, (simplified, vertical));
         }
         quarters(deep, d, children, finest)
     }
@@ -190,7 +199,7 @@ impl Tins<'_> {
     fn of_finer(&self, deep: &Forest, d: Diamond, ground: Ground<'_>, finest: &mut Finest) -> Merged {
         let children = deep.children(d);
         for c in children.into_iter().flatten() {
-            finest.entry(c).or_insert_with(|| {
+            finest.halves.entry(c).or_insert_with(|| {
                 let merged = source(deep, c, ground);
                 // What is drawn is what becomes of it one level up.
                 (simplify(deep, c, &merged, &self.rules(), self.finest_limit(ground)), 0.0)
@@ -219,7 +228,7 @@ impl Tins<'_> {
 fn quarters(deep: &Forest, d: Diamond, children: [Option<Diamond>; 4], finest: &Finest) -> Merged {
     let empty = Tin::default();
     let quarter = |c: Option<Diamond>| {
-        c.and_then(|c| Some(&finest.get(&c)?.0.halves[half_of(deep, c, d)])).unwrap_or(&empty)
+        c.and_then(|c| Some(&finest.halves.get(&c)?.0.halves[half_of(deep, c, d)])).unwrap_or(&empty)
     };
     merge(deep, d, children.map(quarter))
 }
