@@ -177,6 +177,15 @@ fn a_mask_of_another_place_and_heights_beyond_all_measure_are_refused() {
         &["--mask", "own grid", "there.tif", "-72.0"],
         "a mask of elsewhere",
     );
+    assert_failed(
+        &run("{}/dem.tif --samples 129"),
+        2,
+        &["--samples", "80 x 80", "dem.tif", "--samples 65 at most", "found 129"],
+        "a window larger than the DEM",
+    );
+    let below = server(scratch.path(), "experiment curvature {}/dem.tif -o {}/out --eye -5");
+    assert_failed(&below, 2, &["--eye", "above 0", "found -5"], "an eye below the ground");
+    assert_failed(&run("{}/dem.tif --samples -5"), 2, &["'-5'", "--samples"], "a negative count");
     assert_failed(&run("{}/spike.tif"), 1, &["spike.tif", "1000000000", "262 km", "--nodata"], "a spike");
     let ended = server(scratch.path(), "experiment tolerances {}/absent.tif -o {}/never");
     assert_failed(&ended, 1, &["absent.tif"], "no DEM");

@@ -407,6 +407,7 @@ fn a_wrong_render_says_what_is_wrong_and_what_to_do() {
         (format!("{url} -o {{}}/a.png --eye 1,2,3"), 2, &["--target"]),
         (format!("{url} -o {{}}/a.png --eye 1,2,3 --target 1,2,3"), 2, &["same point"]),
         (format!("{url} -o {{}}/a.png --error-pixels 0"), 2, &["--error-pixels 0", "above 0"]),
+        (format!("{url} -o {{}}/a.png --error-pixels -1"), 2, &["--error-pixels -1", "above 0"]),
         (format!("{url} -o {{}}/a.png --error-pixels nan"), 2, &["--error-pixels NaN", "above 0"]),
         (format!("{url} -o {{}}/a.png --encoding smoke"), 2, &["smoke", "points"]),
         (format!("{url} -o {{}}/a.png --background mauve"), 2, &["mauve", "ff00ff"]),

@@ -17,6 +17,16 @@ pub(super) struct Cli {
     pub(super) command: Command,
 }
 
+/// Takes a negative number after every option for a value: what is wrong with it is then told in the option's own words,
+/// and not that `-5` is no option.
+pub(super) fn with_negative_numbers(command: clap::Command) -> clap::Command {
+    let with = |arg: clap::Arg| {
+        let is_option = arg.get_action().takes_values() && !arg.is_positional();
+        if is_option { arg.allow_negative_numbers(true) } else { arg }
+    };
+    command.mut_args(with).mut_subcommands(with_negative_numbers)
+}
+
 #[derive(Subcommand)]
 pub(super) enum Command {
     /// Turn DEM files into a store of diamonds
@@ -58,7 +68,7 @@ pub(super) struct BuildArgs {
     #[arg(long = "layer", id = "layers", value_name = "NAME=KIND:FILE")]
     pub(super) layers: Vec<LayerArg>,
     /// Seconds from a step to the next, of water that changes with time
-    #[arg(long, default_value_t = 1.0, value_name = "SECONDS", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 1.0, value_name = "SECONDS")]
     pub(super) step_seconds: f64,
     /// The folder of the store, or the address of an object store (s3://BUCKET/PREFIX, gs://..., az://...); an older
     /// scene there is replaced once the new one is complete
@@ -69,7 +79,7 @@ pub(super) struct BuildArgs {
     #[arg(long, value_name = "FOLDER")]
     pub(super) work: Option<PathBuf>,
     /// The largest error at the finest level, in metres; 0 is lossless (floats: to the quantum)
-    #[arg(long, default_value_t = 0.0, value_name = "METRES", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 0.0, value_name = "METRES")]
     pub(super) max_error: f64,
     /// The most memory to use
     #[arg(long, default_value = "2GiB", value_name = "BYTES", value_parser = parse_bytes)]
@@ -87,17 +97,17 @@ pub(super) struct BuildArgs {
     #[arg(long, default_value = "normal", value_enum)]
     pub(super) metric: MetricName,
     /// tin: how much borders along nodata count in that order
-    #[arg(long, default_value_t = hierarchy::LAMBDA, value_name = "WEIGHT", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = hierarchy::LAMBDA, value_name = "WEIGHT")]
     pub(super) lambda: f64,
     /// tin: stop at this error instead of a count, in metres: of the finest patches that are simplified, twice as much
     /// every two levels
-    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
+    #[arg(long, value_name = "METRES")]
     pub(super) patch_error: Option<f64>,
     /// How the receiver deduces the height of a fictitious point
     #[arg(long, default_value = "smooth", value_enum)]
     pub(super) rule: RuleName,
     /// Metres of the unit in which heights are stored [default: the source's own unit, or found from it]
-    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
+    #[arg(long, value_name = "METRES")]
     pub(super) quantum: Option<f64>,
     /// How well textures keep their pictures: 1 to 99, as of JPEG; 100: exactly
     #[arg(long, default_value_t = texture::QUALITY, value_name = "N")]
@@ -222,23 +232,23 @@ pub(super) struct ZoneArgs {
     #[arg(long, default_value = "auto", value_enum)]
     pub(super) coordinates: Coordinates,
     /// How far above the highest ground of each polygon the eye may be
-    #[arg(long, value_name = "METRES", required_unless_present = "remove", allow_negative_numbers = true)]
+    #[arg(long, value_name = "METRES", required_unless_present = "remove")]
     pub(super) eye: Option<f64>,
     /// The least height of the ground in the polygons, where the scene has none, as of water
-    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
+    #[arg(long, value_name = "METRES")]
     pub(super) level: Option<f64>,
     /// What the errors of hidden ground count for: 0 to 0.996
-    #[arg(long, default_value_t = zone::HIDDEN, value_name = "SHARE", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = zone::HIDDEN, value_name = "SHARE")]
     pub(super) hidden: f64,
     /// The angle of a pixel: errors grow no larger than what hides them allows. 0: all that is hidden counts for
     /// --hidden, however little it is hidden
-    #[arg(long, default_value_t = zone::ANGLE, value_name = "RADIANS", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = zone::ANGLE, value_name = "RADIANS")]
     pub(super) angle: f64,
     /// The least apparent width of a triangle that a ray must not miss
-    #[arg(long, default_value_t = zone::EPSILON, value_name = "RADIANS", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = zone::EPSILON, value_name = "RADIANS")]
     pub(super) epsilon: f64,
     /// Between eyes along the contour [default: 4 cells, or more for 200 eyes at most]
-    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
+    #[arg(long, value_name = "METRES")]
     pub(super) spacing: Option<f64>,
     /// Let the Earth's curvature hide what is far (with refraction, coefficient 0.13). The client draws a plane:
     /// there, what lies behind the horizon is seen
@@ -302,4 +312,35 @@ pub(super) struct HealthArgs {
     /// The server's address
     #[arg(default_value = "127.0.0.1:8080", value_name = "ADDRESS:PORT")]
     pub(super) address: SocketAddr,
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
+mod tests {
+    use super::*;
+    use clap::{CommandFactory, FromArgMatches};
+
+    /// The options of a command and of those below it that would take `-5` for an option.
+    fn deaf(command: &clap::Command) -> Vec<String> {
+        let own = command.get_opts().filter(|arg| {
+            arg.get_action().takes_values()
+                && !arg.is_allow_negative_numbers_set()
+                && !arg.is_allow_hyphen_values_set()
+        });
+        let own = own.map(|arg| format!("{} {arg}", command.get_name()));
+        own.chain(command.get_subcommands().flat_map(deaf)).collect()
+    }
+
+    #[test]
+    fn every_option_takes_a_negative_number() {
+        let command = with_negative_numbers(Cli::command());
+        assert_eq!(deaf(&command), Vec::<String>::new());
+        let words = ["", "experiment", "curvature", "dem.tif", "-o", "out", "--eye", "-5"];
+        let Command::Experiment(args) =
+            Cli::from_arg_matches(&command.get_matches_from(words)).unwrap().command
+        else {
+            panic!("another command");
+        };
+        assert_eq!(args.output, PathBuf::from("out"));
+    }
 }

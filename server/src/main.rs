@@ -7,7 +7,7 @@ mod series_args;
 
 use arguments::{
     BuildArgs, Cli, Command, ConfigCommand, DemoArgs, Encoding, ExperimentArgs, InspectArgs, MetricName,
-    PublishArgs, RepairArgs, RuleName, ZoneArgs,
+    PublishArgs, RepairArgs, RuleName, ZoneArgs, with_negative_numbers,
 };
 use clap::{ArgMatches, CommandFactory, FromArgMatches};
 use diamantina_protocol::message::is_name;
@@ -67,7 +67,7 @@ fn start_log(format: LogFormat) {
 }
 
 fn main() -> ExitCode {
-    let matches = Cli::command().get_matches();
+    let matches = with_negative_numbers(Cli::command()).get_matches();
     let cli = Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit());
     if !matches!(cli.command, Command::Serve(_)) {
         start_log(LogFormat::Text);

@@ -37,7 +37,7 @@ pub(super) struct LookArgs {
     shading: Option<ShadingName>,
     /// What heights are multiplied by, to make gentle relief visible; errors and the heights of eye and
     /// target are multiplied, too
-    #[arg(long, default_value_t = 1.0, value_name = "N")]
+    #[arg(long, default_value_t = 1.0, value_name = "N", allow_negative_numbers = true)]
     pub(super) exaggeration: f64,
     /// Tint diamonds by their level
     #[arg(long)]
@@ -52,20 +52,20 @@ pub(super) struct LookArgs {
     #[arg(long, value_enum)]
     water: Option<WaterName>,
     /// How high the waves are: 0 is a mirror, 1 a breeze [default: 1]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", allow_negative_numbers = true)]
     waves: Option<f64>,
     /// The depth of water through which a third of green light comes [default: it fits the layer's extent, at most 12]
-    #[arg(long, value_name = "METRES")]
+    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
     clarity: Option<f64>,
     /// How much of the light on the ground imagery is shown in: 0 as it was taken, 1 as if it were the ground's own colour
     /// [default: 0.5]
-    #[arg(long, value_name = "PART")]
+    #[arg(long, value_name = "PART", allow_negative_numbers = true)]
     texture_light: Option<f32>,
     /// The size of the mirrored picture as a part of the picture's: less is faster, and blurred [default: 1]
-    #[arg(long, value_name = "PART")]
+    #[arg(long, value_name = "PART", allow_negative_numbers = true)]
     mirror_scale: Option<f64>,
     /// How many times as large as --error-pixels errors may be in what water mirrors: more is faster [default: 2]
-    #[arg(long, value_name = "TIMES")]
+    #[arg(long, value_name = "TIMES", allow_negative_numbers = true)]
     mirror_error: Option<f64>,
 }
 

@@ -165,7 +165,7 @@ fn one(
     });
     let asked = if run.options.thresholds.is_empty() { plain } else { run.options.thresholds.clone() };
     let series = at_thresholds(window, &rules, asked, thresholds);
-    let axes = ["threshold T", "polygons"];
+    let axes = ["threshold T (a sum of changes of slope: no unit)", "polygons"];
     let bytes = plot::lines(&format!("{}: the same thresholds", window.label()), axes, true, &series)?;
     let caption = "Polygons against the threshold, by rule".to_owned();
     pictures.push(Picture { file: format!("{number}-thresholds.svg"), caption, bytes });

@@ -40,13 +40,7 @@ pub struct Options {
     #[command(flatten)]
     pub(crate) windows: windows::Options,
     /// `tolerances`, `strips`, `zone`: tolerances, percent of each window's relief
-    #[arg(
-        long,
-        value_delimiter = ',',
-        default_value = "0,1,2,7,10,14,50",
-        value_name = "PERCENT",
-        allow_negative_numbers = true
-    )]
+    #[arg(long, value_delimiter = ',', default_value = "0,1,2,7,10,14,50", value_name = "PERCENT")]
     pub(crate) tolerances: Vec<f64>,
     /// `tolerances`: also bitrees of these numbers of points, the four corners included, the largest errors first
     #[arg(long, value_delimiter = ',', value_name = "N")]
@@ -68,10 +62,10 @@ pub struct Options {
     #[arg(long, default_value_t = 50.0, value_name = "METRES")]
     pub(crate) eye: f64,
     /// `curvature`: how much distance forgives: a in T (a d / D + 1)
-    #[arg(long, default_value_t = 20.0, value_name = "A", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 20.0, value_name = "A")]
     pub(crate) forgiveness: f64,
-    /// `curvature`: thresholds T at which the polygons of all rules are counted, in the units of its table [default: those of the plain rule's shares]
-    #[arg(long, value_delimiter = ',', value_name = "T", allow_negative_numbers = true)]
+    /// `curvature`: thresholds T at which the polygons of all rules are counted, sums of changes of slope without a unit [default: those of the plain rule's shares]
+    #[arg(long, value_delimiter = ',', value_name = "T")]
     pub(crate) thresholds: Vec<f64>,
 }
 

@@ -117,6 +117,16 @@ pub(super) fn read(
             let expected = format!("a sample of {name}, up to {},{}", grid.width - 1, grid.height - 1);
             return Err(bad("--at", &expected, format!("{x},{y}")));
         }
+        // A window at a place may reach beyond a side, as it may lie over voids; one that no place would fill is a slip.
+        let sides = [grid.width, grid.height];
+        if options.windows == Rule::One && sides.iter().any(|side| options.samples > *side) {
+            let [width, height] = sides;
+            let expected = format!(
+                "a window that fits into the {width} x {height} samples of {name}: {}",
+                fitting(sides)
+            );
+            return Err(bad("--samples", &expected, options.samples.to_string()));
+        }
         let mask = mask.map(|m| open_mask(m, ingest, &source)).transpose()?;
         let (places, before) = (places(&source, options, cells), windows.len());
         progress.stage("reading windows", "windows", places.len() as u64, 0);
@@ -152,6 +162,14 @@ pub(super) fn read(
         return Err(bad("--windows", "at least one window that fits the rule", format!("none in {names}")));
     }
     Ok(windows)
+}
+
+/// What to say of windows for a DEM with these sides.
+fn fitting(sides: [u32; 2]) -> String {
+    match sides[0].min(sides[1]).saturating_sub(1).checked_ilog2() {
+        Some(log2 @ 1..) => format!("--samples {} at most", (1u32 << log2.min(12)) + 1),
+        _ => "no window fits, a larger DEM is needed".to_owned(),
+    }
 }
 
 /// How many windows each DEM has, also where it has none.
@@ -249,4 +267,19 @@ fn weights(mask: &Source, at: Point, log2: u8) -> Result<Vec<f32>, ExperimentErr
     }
     #[allow(clippy::cast_possible_truncation, reason = "from 0 to 1")]
     Ok(field.heights().iter().map(|h| if h.is_nan() { 0.0 } else { *h as f32 }).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_largest_window_that_fits_is_told() {
+        assert_eq!(fitting([374, 394]), "--samples 257 at most");
+        assert_eq!(fitting([513, 600]), "--samples 513 at most");
+        assert_eq!(fitting([512, 600]), "--samples 257 at most");
+        assert_eq!(fitting([9000, 10_000]), "--samples 4097 at most");
+        assert_eq!(fitting([3, 80]), "--samples 3 at most");
+        assert!(fitting([2, 80]).starts_with("no window fits"));
+    }
 }

@@ -40,16 +40,16 @@ pub(crate) struct Options {
     #[arg(long, value_enum, default_value_t = Coordinates::Auto)]
     pub(crate) coordinates: Coordinates,
     /// `zone`: what the errors of hidden ground count for: 0 to 0.996
-    #[arg(long, default_value_t = HIDDEN, value_name = "SHARE", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = HIDDEN, value_name = "SHARE")]
     pub(crate) hidden: f64,
     /// `zone`: the angle of a pixel: what is hidden by less counts fully. 0: all that is hidden counts for --hidden
-    #[arg(long, default_value_t = ANGLE, value_name = "RADIANS", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = ANGLE, value_name = "RADIANS")]
     pub(crate) angle: f64,
     /// `zone`: the least apparent width of a triangle that a ray must not miss
-    #[arg(long, default_value_t = EPSILON, value_name = "RADIANS", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = EPSILON, value_name = "RADIANS")]
     pub(crate) epsilon: f64,
     /// `zone`: metres between eyes along the contour [default: 4 cells, or more for 200 eyes at most]
-    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
+    #[arg(long, value_name = "METRES")]
     pub(crate) spacing: Option<f64>,
 }
 

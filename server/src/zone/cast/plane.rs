@@ -11,6 +11,12 @@ use super::{Eye, Optics};
 use crate::zone::relief::{BLOCKS_LOG2, Relief};
 use crate::zone::tiled::Tiled;
 
+/// No plane leans closer than this to one cell a column. Along a diagonal, rounding would say anew in each cell on
+/// which side of it the plane is, and rays would pass voids of both sides, where each side is whole. This is so little
+/// that nothing is seen otherwise, and so much that a cell from the eye rounding is far smaller, in reliefs of a million
+/// samples, too.
+const OFF_DIAGONAL: f64 = 1e-9;
+
 /// The vertical plane of an azimuth. Columns of cells are crossed one by one along the major axis, the one along
 /// which the azimuth crosses more of them; `u` counts cells along it from the eye.
 pub(super) struct Plane<'a> {
@@ -24,7 +30,7 @@ pub(super) struct Plane<'a> {
     pub(super) height: f64,
     /// 1 where the azimuth goes up the major axis, else -1.
     pub(super) sign: f64,
-    /// Cells along the minor axis for one along the major: -1 to 1.
+    /// Cells along the minor axis for one along the major: between -1 and 1, by [`OFF_DIAGONAL`] at least.
     pub(super) lean: f64,
     /// Its inverse. Kept, as is `across`: a division costs more than all else at a crossing.
     pub(super) unlean: f64,
@@ -71,9 +77,11 @@ pub(super) fn lowest_slope(height: f64, [near, far]: [&Post; 2]) -> f64 {
 impl<'a> Plane<'a> {
     pub(super) fn new(relief: &'a Relief, optics: &Optics, eye: Eye, azimuth: f64) -> Self {
         let along = [azimuth.cos() / optics.cell[0], azimuth.sin() / optics.cell[1]];
-        let major = usize::from(along[1].abs() > along[0].abs());
+        // Whichever of both rounding makes the longer along a diagonal, it is x.
+        let major = usize::from(along[1].abs() * (1.0 - OFF_DIAGONAL) > along[0].abs());
         let steep = along[major].abs();
-        let (sign, lean) = (1f64.copysign(along[major]), along[1 - major] / steep);
+        let most = 1.0 - OFF_DIAGONAL;
+        let (sign, lean) = (1f64.copysign(along[major]), (along[1 - major] / steep).clamp(-most, most));
         Self {
             relief,
             heights: relief.heights(),

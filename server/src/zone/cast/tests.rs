@@ -427,3 +427,44 @@ fn rounding_opens_no_windows_beside_holes() {
     }
     assert!(opened > 1000, "{opened}");
 }
+
+/// A ray along the edges of triangles keeps to one side of them: it does not look through a void on the one side and then
+/// through one on the other.
+#[test]
+fn along_a_diagonal_rays_keep_to_one_side() {
+    // An odd count, so that diagonals turn with it.
+    let side = 25usize;
+    // Two peaks on the diagonal to the east and north, the first with voids to its right, the second to its left.
+    let mut heights = vec![0; side * side];
+    let [first, second] = [15, 18];
+    for (peak, voids) in [
+        (first, [[first, first - 1], [first + 1, first]]),
+        (second, [[second - 1, second], [second, second + 1]]),
+    ] {
+        heights[peak * side + peak] = 1000;
+        voids.iter().for_each(|[x, y]| heights[y * side + x] = NODATA);
+    }
+    for cell in [[1.0, 1.0], [77.0, 93.0], [93.0, 77.0]] {
+        let optics = Optics { cell, quantum: 1.0, ..ROUGH };
+        // All four diagonals, by turning the relief a quarter each time.
+        for quarter in 0..4 {
+            let turned = |[x, y]: [usize; 2]| (0..quarter).fold([x, y], |[x, y], _| [y, side - 1 - x]);
+            let rows = (0..side * side).map(|i| turned([i % side, i / side]));
+            let rows: Vec<i32> = rows.map(|[x, y]| heights[y * side + x]).collect();
+            let relief = Relief::from_rows([side; 2], &rows);
+            let [x, y] = [[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]][quarter];
+            let azimuth = f64::atan2(y * cell[1], x * cell[0]);
+            for i in 0..1000 {
+                let along = f64::from(i) / 997.0;
+                let at = |sign: f64| if sign > 0.0 { along } else { (side - 1) as f64 - along } + sign * 10.0;
+                let eye = Eye { place: [at(x), at(y)], height: 1.0 };
+                walk(&relief, &optics, eye, azimuth, |seen| {
+                    let Region::Triangle(corners) = seen.region else { return };
+                    // From the turned relief back to the first.
+                    let beyond = corners.map(turned).into_iter().all(|c| c.iter().all(|w| *w > second));
+                    assert!(!beyond, "{cell:?}, {quarter} quarters, eye {i}: {corners:?}");
+                });
+            }
+        }
+    }
+}
