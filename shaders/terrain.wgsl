@@ -64,8 +64,20 @@ fn level_tint(level: f32) -> vec3<f32> {
     return 0.5 + 0.5 * cos(6.2831853 * turn);
 }
 
+// Heights that are multiplied by more than this are lit softly as if by this: almost all ground would face sideways, where
+// neither the sun nor the sky overhead reaches it, and be black.
+const LIT_EXAGGERATION: f32 = 2.0;
+
+// The unit normal that light falls on.
+fn lit_normal(shaded: Shaded) -> vec3<f32> {
+    if frame.style.x != 0.0 || layer.exaggeration <= LIT_EXAGGERATION {
+        return normal_of(shaded);
+    }
+    return stretched_normal(shaded, LIT_EXAGGERATION);
+}
+
 fn terrain_colour(shaded: Shaded) -> vec4<f32> {
-    let normal = normal_of(shaded);
+    let normal = lit_normal(shaded);
     let imagery = imagery_at(shaded.tile, shaded.drape, dpdx(shaded.drape), dpdy(shaded.drape)) * frame.drape.y;
     let height = (frame.sun.w + shaded.from_eye.z) / layer.exaggeration;
     let value = select(height, slope_of(shaded), frame.style.y != 0.0);
