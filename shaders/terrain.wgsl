@@ -78,12 +78,15 @@ fn lit_normal(shaded: Shaded) -> vec3<f32> {
 
 fn terrain_colour(shaded: Shaded) -> vec4<f32> {
     let normal = lit_normal(shaded);
-    let imagery = imagery_at(shaded.tile, shaded.drape, dpdx(shaded.drape), dpdy(shaded.drape)) * frame.drape.y;
+    var imagery = imagery_at(shaded.tile, shaded.drape, dpdx(shaded.drape), dpdy(shaded.drape)) * frame.drape.y;
     let height = (frame.sun.w + shaded.from_eye.z) / layer.exaggeration;
     let value = select(height, slope_of(shaded), frame.style.y != 0.0);
     var albedo = albedo_at(value, max(fwidth(height), 1e-6), normal.z);
     if frame.options.y != 0.0 {
-        albedo = mix(albedo, level_tint(round(shaded.about.z)), 0.5);
+        let tint = level_tint(round(shaded.about.z));
+        albedo = mix(albedo, tint, 0.5);
+        // Levels are those of the ground's triangles: they show through whatever lies on it.
+        imagery = vec4<f32>(mix(imagery.rgb, tint * imagery.a, 0.5), imagery.a);
     }
     // Pictures of the ground have its light in them already: how much more they get is for the viewer to say.
     let ground = shaded_colour(albedo, normal) * (1.0 - imagery.a);
