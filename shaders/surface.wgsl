@@ -97,9 +97,14 @@ fn tin_vertex(corner: Corner) -> Shaded {
     return placed(corner.origin + corner.place, corner.height, 0.0, corner.normal, corner.about, corner.drape);
 }
 
-// The unit normal, of the stretched surface.
-fn normal_of(shaded: Shaded) -> vec3<f32> {
+// The unit normal, of the surface if its heights are multiplied by so much.
+fn stretched_normal(shaded: Shaded, exaggeration: f32) -> vec3<f32> {
     let across = shaded.about.xy;
     let up = sqrt(max(1.0 - dot(across, across), 0.0));
-    return normalize(vec3<f32>(across * layer.exaggeration, up));
+    return normalize(vec3<f32>(across * exaggeration, up));
+}
+
+// The unit normal, of the stretched surface.
+fn normal_of(shaded: Shaded) -> vec3<f32> {
+    return stretched_normal(shaded, layer.exaggeration);
 }

@@ -64,14 +64,29 @@ fn level_tint(level: f32) -> vec3<f32> {
     return 0.5 + 0.5 * cos(6.2831853 * turn);
 }
 
+// Heights that are multiplied by more than this are lit softly as if by this: almost all ground would face sideways, where
+// neither the sun nor the sky overhead reaches it, and be black.
+const LIT_EXAGGERATION: f32 = 2.0;
+
+// The unit normal that light falls on.
+fn lit_normal(shaded: Shaded) -> vec3<f32> {
+    if frame.style.x != 0.0 || layer.exaggeration <= LIT_EXAGGERATION {
+        return normal_of(shaded);
+    }
+    return stretched_normal(shaded, LIT_EXAGGERATION);
+}
+
 fn terrain_colour(shaded: Shaded) -> vec4<f32> {
-    let normal = normal_of(shaded);
-    let imagery = imagery_at(shaded.tile, shaded.drape, dpdx(shaded.drape), dpdy(shaded.drape)) * frame.drape.y;
+    let normal = lit_normal(shaded);
+    var imagery = imagery_at(shaded.tile, shaded.drape, dpdx(shaded.drape), dpdy(shaded.drape)) * frame.drape.y;
     let height = (frame.sun.w + shaded.from_eye.z) / layer.exaggeration;
     let value = select(height, slope_of(shaded), frame.style.y != 0.0);
     var albedo = albedo_at(value, max(fwidth(height), 1e-6), normal.z);
     if frame.options.y != 0.0 {
-        albedo = mix(albedo, level_tint(round(shaded.about.z)), 0.5);
+        let tint = level_tint(round(shaded.about.z));
+        albedo = mix(albedo, tint, 0.5);
+        // Levels are those of the ground's triangles: they show through whatever lies on it.
+        imagery = vec4<f32>(mix(imagery.rgb, tint * imagery.a, 0.5), imagery.a);
     }
     // Pictures of the ground have its light in them already: how much more they get is for the viewer to say.
     let ground = shaded_colour(albedo, normal) * (1.0 - imagery.a);

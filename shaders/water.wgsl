@@ -47,12 +47,13 @@ fn wave_slope(across: vec2<f32>, right: vec2<f32>, down: vec2<f32>) -> vec3<f32>
     var shortest = 0.0;
     for (var i = 0; i < 10; i++) {
         let wave = water.waves[i];
-        // Radians of the wave that a pixel covers: beyond pi its samples show another wave.
+        // Radians of the wave that a pixel covers: beyond pi its samples show another wave. They are gone long before: from
+        // afar the longest alone would be left, as stripes.
         let step = max(abs(dot(wave.xy, right)), abs(dot(wave.xy, down)));
-        let seen = 1.0 - smoothstep(0.3, 1.2, step);
+        let seen = 1.0 - smoothstep(0.12, 0.6, step);
         let along = wave.xy / length(wave.xy) * (wave.w * seen * cos(dot(wave.xy, across) + wave.z));
         slope += vec3<f32>(along, 0.25 * wave.w * wave.w * (1.0 - seen * seen));
-        shortest = max(shortest, 1.0 - seen);
+        shortest = max(shortest, smoothstep(0.3, 1.2, step));
     }
     return slope + vec3<f32>(0.0, 0.0, mix(RIPPLES.x, RIPPLES.y, shortest));
 }
@@ -70,11 +71,34 @@ fn glitter_of(ray: vec3<f32>, normal: vec3<f32>, variance: f32) -> f32 {
     return share / (4.0 * steep * steep * max(-dot(ray, normal), 0.1));
 }
 
+fn exact_depth(place: vec2<f32>) -> f32 {
+    return textureSampleLevel(scene_depth, exact_sampler, place, 0.0).x;
+}
+
+// The depth of the scene without water at a place of the screen, between the four pixels around it: the nearest pixel's
+// would jump, and its jumps show as contours of the bed. One over the distance is straight along a plane, so that it may be
+// mixed as it is; not across an outline, where nothing lies between what is near and what is far.
+fn depth_at(place: vec2<f32>) -> f32 {
+    let size = vec2<f32>(textureDimensions(scene));
+    let corner = floor(place * size - 0.5) + 0.5;
+    let part = place * size - corner;
+    let low = corner / size;
+    let high = (corner + 1.0) / size;
+    let a = exact_depth(low);
+    let b = exact_depth(vec2<f32>(high.x, low.y));
+    let c = exact_depth(vec2<f32>(low.x, high.y));
+    let d = exact_depth(high);
+    let least = min(min(a, b), min(c, d));
+    if max(max(a, b), max(c, d)) > 1.25 * least {
+        return exact_depth(place);
+    }
+    return mix(mix(a, b, part.x), mix(c, d, part.x), part.y);
+}
+
 // Metres from the eye to what the scene without water shows at a place of the screen, along a ray that goes `forward`
 // metres ahead a metre; a great many where that is the sky.
 fn scene_distance(place: vec2<f32>, forward: f32) -> f32 {
-    let depth = textureSampleLevel(scene_depth, exact_sampler, place, 0.0).x;
-    return water.optics.z / max(depth, 1e-20) / forward;
+    return water.optics.z / max(depth_at(place), 1e-20) / forward;
 }
 
 fn ray_through(place: vec2<f32>) -> vec3<f32> {
@@ -86,6 +110,36 @@ fn ray_through(place: vec2<f32>) -> vec3<f32> {
 fn outside(place: vec2<f32>) -> f32 {
     let beyond = max(abs(place - 0.5) - 0.5, vec2<f32>(0.0));
     return max(beyond.x, beyond.y);
+}
+
+// Ripples too small to be seen make the mirrored picture soft: what of their variance does so, and how far apart in their
+// slopes the picture is read, in deviations.
+const SOFTENING: f32 = 0.03;
+const TAP: f32 = 0.2;
+
+// The mirrored picture at a place of the screen and above what it shows there, as facets see it whose slopes vary about those
+// of `normal` by `variance`. Facets that lean towards the eye move what they mirror by twice as much, upwards; those that lean
+// away are hidden, or mirror other waves, and those that lean aside hardly move it: a row of places is enough, which does not
+// go past a shore.
+fn blurred(image: vec3<f32>, ray: vec3<f32>, normal: vec3<f32>, variance: f32) -> vec4<f32> {
+    if water.optics.w == 0.0 || image.z == 0.0 {
+        return textureSampleLevel(mirrored, smooth_sampler, image.xy, 0.0);
+    }
+    let ahead = ray.xy / max(length(ray.xy), 1e-6);
+    let lean = TAP * sqrt(SOFTENING * variance);
+    let leaning = normalize(vec3<f32>(normal.xy / max(normal.z, 0.1) - lean * ahead, 1.0));
+    let moved = reflect(ray, leaning);
+    let still = reflect(ray, normal);
+    let step = projected(vec3<f32>(moved.xy, -moved.z) * 1e6).xy - projected(vec3<f32>(still.xy, -still.z) * 1e6).xy;
+    var sum = vec4<f32>(0.0);
+    var weights = 0.0;
+    for (var i = 0; i < 12; i++) {
+        let off = f32(i) * TAP;
+        let weight = exp(-0.5 * off * off);
+        sum += weight * textureSampleLevel(mirrored, smooth_sampler, image.xy + f32(i) * step, 0.0);
+        weights += weight;
+    }
+    return sum / weights;
 }
 
 @fragment
@@ -140,14 +194,14 @@ fn water_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
     back = normalize(vec3<f32>(back.xy, abs(back.z)));
     var image = projected(vec3<f32>(back.xy, -back.z) * 1e6);
     // Past a shore the mirrored picture shows what is behind the bank, whose foot is clipped: there the still surface's
-    // is nearer to the truth.
+    // is nearer to the truth; the more so the higher the bank, without an edge.
     let inside = clamp(image.xy, vec2<f32>(0.0), vec2<f32>(1.0));
     let beyond = ray_through(inside);
     let bank = beyond.z * scene_distance(inside, dot(beyond, frame.forward.xyz));
-    if image.z > 0.0 && bank > p.z + 0.002 * distance && bank < 1e9 {
-        image = vec3<f32>(here, 1.0);
+    if image.z > 0.0 && bank < 1e9 {
+        image = vec3<f32>(mix(image.xy, here, smoothstep(0.0, 0.02, (bank - p.z) / distance)), 1.0);
     }
-    let found = textureSampleLevel(mirrored, smooth_sampler, image.xy, 0.0);
+    let found = blurred(image, ray, normal, slope.z);
     // Past the edges nothing was drawn.
     let lost = select(1.0, smoothstep(0.0, 0.1, outside(image.xy)), image.z > 0.0);
     // Still water mirrors the sun's disc, where alpha says that there is sky; waves break it into the glitter below.

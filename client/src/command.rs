@@ -414,6 +414,9 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
     if args.json.as_ref().is_none_or(|p| p.as_os_str() != "-") {
         shown(print_report(args, &report))?;
     }
+    if let Some(words) = headless::below_ground(report.eye[2], report.ground_at_eye) {
+        let _ = writeln!(std::io::stderr(), "notice: {words}");
+    }
     let why = match (report.complete, report.limited_by_memory) {
         (true, false) => return Ok(()),
         (true, true) => "there is no memory for less: raise --memory or --gpu-memory",

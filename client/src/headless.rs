@@ -12,7 +12,7 @@ use crate::surface::Surface;
 use crate::terrain::{FrameView, Stats, Terrain, TerrainError};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::{Block, Diamond};
-use diamantina_protocol::message::{Layer, Scene};
+use diamantina_protocol::message::{Kind, Layer, Scene};
 use glam::DVec3;
 use serde::Serialize;
 use std::fs::File;
@@ -139,6 +139,8 @@ pub struct PictureReport {
     pub eye: [f64; 3],
     /// What the camera looks at.
     pub target: [f64; 3],
+    /// How high the ground is below the eye, or above it: water is none. `null` where nothing is drawn.
+    pub ground_at_eye: Option<f64>,
     /// Width and height, in pixels.
     pub size: [u32; 2],
     /// Bytes of all answers.
@@ -272,6 +274,26 @@ impl Annotator {
     }
 }
 
+/// The height of the drawn ground where the eye is, as it was measured.
+fn ground_at_eye(terrain: &Terrain, camera: &Camera, look: &Look, items: &[DrawItem]) -> Option<f64> {
+    let layers = &terrain.scene().layers;
+    let is_ground = |item: &&DrawItem| layers.get(item.layer).is_some_and(|l| l.kind == Kind::Terrain);
+    let ground: Vec<_> = items.iter().filter(is_ground).cloned().collect();
+    let stretched = Picker::default().ground(layers, &ground, look.exaggeration, camera.eye.truncate())?;
+    Some(stretched / look.exaggeration)
+}
+
+/// What to say where an eye of this height is under the ground, whose inside the picture shows.
+#[must_use]
+pub fn below_ground(eye: f64, ground: Option<f64>) -> Option<String> {
+    let ground = ground.filter(|ground| eye < *ground)?;
+    let deep = ground - eye;
+    Some(format!(
+        "the eye is {deep:.2} m below the ground, which is {ground:.2} m high there and is drawn as it is seen from below: \
+         to look from above, give --eye a height of more than {ground:.2}"
+    ))
+}
+
 fn report(
     terrain: &Terrain,
     camera: &Camera,
@@ -286,6 +308,7 @@ fn report(
         version: terrain.scene().version.clone(),
         eye: camera.eye.to_array(),
         target: camera.target.to_array(),
+        ground_at_eye: ground_at_eye(terrain, camera, look, &view.items),
         size: camera.size,
         bytes: traffic.bytes,
         requests: traffic.requests,
@@ -361,6 +384,18 @@ pub fn open_text(path: &Path) -> Result<Box<dyn Write>, HeadlessError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_eye_below_the_ground_is_told() {
+        let words = below_ground(-3.25, Some(12.5)).unwrap();
+        assert!(
+            ["15.75 m below", "12.50 m high", "--eye"].iter().all(|word| words.contains(word)),
+            "{words}"
+        );
+        for (eye, ground) in [(12.6, Some(12.5)), (12.5, Some(12.5)), (-9e9, None)] {
+            assert_eq!(below_ground(eye, ground), None, "{eye} {ground:?}");
+        }
+    }
 
     #[test]
     fn a_picture_is_written_whole_or_not_at_all() {

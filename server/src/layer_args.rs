@@ -127,6 +127,15 @@ fn expand(layer: &LayerArg) -> Result<LayerArg, String> {
     Ok(LayerArg { data: Data::Steps(files), ..layer.clone() })
 }
 
+/// What to say of series whose files lack numbers.
+pub(super) fn gaps(layers: &[LayerArg]) -> Vec<String> {
+    let told = layers.iter().filter_map(|layer| match &layer.data {
+        Data::Steps(files) => series_args::gap(files).map(|words| format!("--layer {}: {words}", layer.name)),
+        _ => None,
+    });
+    told.collect()
+}
+
 /// Puts together what belongs to one layer: first the files without a name, then the others in the order in which they are
 /// named.
 ///

@@ -176,6 +176,9 @@ fn build(args: &BuildArgs) -> Result<(), Failure> {
         ));
     }
     let layers = layer_args::join(&args.sources, &args.layers).map_err(|e| Failure(2, e))?;
+    for words in layer_args::gaps(&layers) {
+        let _ = writeln!(std::io::stderr(), "notice: {words}");
+    }
     // Flat water has as many cells as the least forest.
     let opened = Layers::open(layers, &args.ingest, options.patch_log2 + 1, args.step_seconds);
     let layers = opened.map_err(|e| match e {

@@ -42,6 +42,43 @@ pub(super) fn files(pattern: &str) -> Result<Vec<PathBuf>, String> {
     Ok(files)
 }
 
+/// Numbers in a name, in their order, and the text around them.
+fn numbers(name: &str) -> (Vec<u64>, Vec<&str>) {
+    let found = name.split(|c: char| !c.is_ascii_digit()).filter(|digits| !digits.is_empty());
+    let text = name.split(|c: char| c.is_ascii_digit()).filter(|text| !text.is_empty()).collect();
+    // A number too long for this is some identifier; two such differ in no gap.
+    (found.map(|digits| digits.parse().unwrap_or(u64::MAX)).collect(), text)
+}
+
+/// Where numbers in the names of steps are missing, if so: they differ in one number, which mostly grows by a stride. A
+/// constant stride, whatever it is, has no gap.
+pub(super) fn gap(files: &[PathBuf]) -> Option<String> {
+    let names: Vec<_> =
+        files.iter().map(|file| file.file_name().unwrap_or_default().to_string_lossy()).collect();
+    let told: Vec<_> = names.iter().map(|name| numbers(name)).collect();
+    let (first, text) = told.first()?;
+    let is_alike = |(other, words): &(Vec<u64>, Vec<&str>)| other.len() == first.len() && words == text;
+    if !told.iter().all(is_alike) {
+        return None;
+    }
+    let mut varying = (0..first.len()).filter(|i| told.iter().any(|(other, _)| other[*i] != first[*i]));
+    let (Some(place), None) = (varying.next(), varying.next()) else { return None };
+    let strides: Vec<u64> =
+        told.windows(2).map(|pair| pair[1].0[place].saturating_sub(pair[0].0[place])).collect();
+    let least = strides.iter().copied().filter(|stride| *stride > 0).min()?;
+    let wide: Vec<usize> = (0..strides.len()).filter(|i| strides[*i] > least).collect();
+    let from = *wide.first()?;
+    let more = match wide.len() {
+        1 => String::new(),
+        count => format!(", and at {} more places", count - 1),
+    };
+    Some(format!(
+        "no file between {} and {}, where numbers go by {least} elsewhere{more}: all steps take equally long, this one too",
+        names[from],
+        names[from + 1]
+    ))
+}
+
 /// The name of the layer that is a step of a series. No layer that users name has a dot in it.
 pub(super) fn step_name(series: &str, step: usize) -> String {
     format!("{series}.{step}")
@@ -105,6 +142,26 @@ mod tests {
         let error = found("many_*.asc").unwrap_err();
         assert!(error.contains("at most 254 files, found 255"), "{error}");
         assert_eq!(names("many_*1.asc").len(), 26);
+    }
+
+    #[test]
+    fn a_gap_in_the_numbers_is_told() {
+        let told = |names: &[&str]| gap(&names.iter().map(PathBuf::from).collect::<Vec<_>>());
+        let gap = told(&["a/f_0.tif", "a/f_1.tif", "a/f_3.tif"]).unwrap();
+        assert!(gap.starts_with("no file between f_1.tif and f_3.tif") && gap.contains("go by 1 "), "{gap}");
+        let more = told(&["sea2_0000.tif", "sea2_0010.tif", "sea2_0030.tif", "sea2_0050.tif"]).unwrap();
+        assert!(more.contains("sea2_0010.tif and sea2_0030.tif"), "{more}");
+        assert!(more.contains("go by 10 ") && more.contains("at 1 more places"), "{more}");
+        for even in [
+            &["f_0.tif", "f_10.tif", "f_20.tif"][..],
+            &["f_7.tif"],
+            &["f_7.tif", "f_9.tif"],
+            // Days and hours are no count.
+            &["d_1_h_1.tif", "d_1_h_2.tif", "d_2_h_4.tif"],
+            &["ebb.tif", "flood.tif", "slack.tif"],
+        ] {
+            assert_eq!(told(even), None, "{even:?}");
+        }
     }
 
     #[test]

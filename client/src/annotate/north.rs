@@ -1,15 +1,15 @@
 //! A north arrow: a compass that lies on the level where the middle of the picture is, as it is seen from there.
 //!
 //! Its needle points to the north pole where the frame's place on the globe is known, else along the frame's y axis. It is
-//! foreshortened as level ground is; where the camera looks down by less than 7 degrees, or up, it is drawn as from 7
-//! degrees above, or it would be a line, or upside down.
+//! foreshortened as level ground is; where the camera looks down by less than 20 degrees, or up, it is drawn as from 20
+//! degrees above, or its needle would be a line, or upside down.
 
 use super::{Anchor, Ink, Subject, on_screen, put, text};
-use egui::{Align2, Color32, Painter, Pos2, Rect, Shape, Stroke, vec2};
+use egui::{Align2, Color32, Mesh, Painter, Pos2, Rect, Shape, Stroke, vec2};
 use glam::DVec2;
 
 /// The sine of the flattest angle at which it is drawn.
-const FLATTEST: f64 = 0.12;
+const FLATTEST: f64 = 0.342;
 
 /// Points from the compass's middle to the needle's tip.
 const RADIUS: f64 = 27.0;
@@ -17,6 +17,21 @@ const RADIUS: f64 = 27.0;
 /// The direction to north at the anchor, a unit vector of the frame.
 pub(super) fn direction(subject: &Subject<'_>, anchor: Anchor) -> DVec2 {
     subject.globe.and_then(|globe| globe.north(anchor.place)).unwrap_or(DVec2::Y)
+}
+
+/// Half of the needle. Its outline is drawn side by side: as one it would be pointed, and the points of a narrow one shoot far
+/// out of it.
+fn half(painter: &Painter, corners: [Pos2; 3], colour: Color32, is_filled: bool) {
+    if is_filled {
+        let mut inside = Mesh::default();
+        corners.iter().for_each(|corner| inside.colored_vertex(*corner, colour));
+        inside.add_triangle(0, 1, 2);
+        painter.add(inside);
+    }
+    let [a, b, c] = corners;
+    for side in [[a, b], [b, c], [c, a]] {
+        painter.line_segment(side, Stroke::new(1.0, colour));
+    }
 }
 
 pub(super) fn show(painter: &Painter, area: Rect, ink: &Ink, subject: &Subject<'_>, anchor: Anchor) {
@@ -39,10 +54,8 @@ pub(super) fn show(painter: &Painter, area: Rect, ink: &Ink, subject: &Subject<'
         painter.line_segment(mark, Stroke::new(1.0, ink.faint));
     }
     // One half filled, as on printed maps.
-    let halves = [(0.3, ink.text), (-0.3, Color32::TRANSPARENT)];
-    for (side, fill) in halves {
-        let half = vec![at(1.0, 0.0), at(-0.62, side), at(-0.36, 0.0)];
-        painter.add(Shape::convex_polygon(half, fill, Stroke::new(1.0, ink.text)));
+    for (side, is_filled) in [(0.3, true), (-0.3, false)] {
+        half(painter, [at(1.0, 0.0), at(-0.62, side), at(-0.36, 0.0)], ink.text, is_filled);
     }
     let tip = at(1.0, 0.0);
     let ahead = (tip - middle).normalized();

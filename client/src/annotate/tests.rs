@@ -110,6 +110,53 @@ fn the_arrow_points_where_a_step_to_the_north_is_seen() {
     assert!([0.0, -4.0].iter().all(|pitch| on_screen(&camera(0.0, *pitch), DVec2::Y, 0.12).y < -0.1));
 }
 
+/// What is drawn of the arrow stays on its plate however low the eye, and the needle has a body.
+#[test]
+fn the_arrow_keeps_to_its_plate_and_its_letter_is_free() {
+    let look =
+        Look { annotations: Annotations { north_arrow: true, ..Annotations::default() }, ..Look::default() };
+    let screen = Rect::from_min_size(Pos2::ZERO, vec2(1380.0, 768.0));
+    for heading in (0..36).map(|tens| f64::from(tens) * 10.0) {
+        for pitch in [-20.0, 0.0, 3.0, 20.0, 60.0, 89.0] {
+            let context = egui::Context::default();
+            let camera = camera(heading, pitch);
+            let input = egui::RawInput { screen_rect: Some(screen), ..egui::RawInput::default() };
+            let output = context.run_ui(input, |ui| {
+                show(ui.painter(), ui.max_rect(), &subject(&camera, &look));
+            });
+            let shapes = &output.shapes;
+            let plate = shapes.iter().find_map(|s| match &s.shape {
+                egui::Shape::Rect(plate) => Some(plate.rect),
+                _ => None,
+            });
+            let letter = shapes.iter().find_map(|s| match &s.shape {
+                egui::Shape::Text(text) => Some(text.visual_bounding_rect()),
+                _ => None,
+            });
+            let filled = shapes.iter().find_map(|s| match &s.shape {
+                egui::Shape::Mesh(mesh) => Some(mesh.vertices.iter().map(|v| v.pos).collect::<Vec<_>>()),
+                _ => None,
+            });
+            let (plate, letter, needle) = (plate.unwrap(), letter.unwrap(), filled.unwrap());
+            let [a, b, c] = [needle[0], needle[1], needle[2]];
+            let area = ((b - a).x * (c - a).y - (b - a).y * (c - a).x).abs() / 2.0;
+            assert!(area > 25.0, "{heading} {pitch}: {area} square points");
+            // The cross in the middle of the picture is not the arrow's.
+            let is_here = |s: &&egui::epaint::ClippedShape| s.shape.visual_bounding_rect().intersects(plate);
+            let lines = shapes.iter().filter(is_here).filter(|s| !matches!(s.shape, egui::Shape::Text(_)));
+            let drawn = context.tessellate(lines.cloned().collect(), 1.0);
+            for clipped in &drawn {
+                let egui::epaint::Primitive::Mesh(mesh) = &clipped.primitive else { continue };
+                let is_out = |v: &&egui::epaint::Vertex| !plate.expand(1.0).contains(v.pos);
+                assert_eq!(mesh.vertices.iter().find(is_out), None, "{heading} {pitch}");
+            }
+            let is_in_letter = |corner: &Pos2| letter.expand(0.5).contains(*corner);
+            assert!(!needle.iter().any(is_in_letter), "{heading} {pitch}: {needle:?} in {letter}");
+            output.drop_without_applying_deltas();
+        }
+    }
+}
+
 #[test]
 fn labels_are_round_and_stand_at_their_values() {
     let layer = |heights| Layer { heights, ..world()[0].layer.clone() };

@@ -7,6 +7,7 @@
     reason = "made-up numbers, small and positive"
 )]
 
+mod legible;
 mod motion;
 mod truth;
 mod water;

@@ -21,7 +21,7 @@ use glam::{DVec2, DVec3};
 use std::collections::BTreeMap;
 
 /// What textures between passes hold: colours, linear when read.
-const TARGET: Target = Target { format: wgpu::TextureFormat::Rgba8UnormSrgb, samples: 1 };
+const FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8UnormSrgb;
 
 /// Waves that are added up; the twin of a number in `shaders/water.wgsl`.
 const WAVES: usize = 10;
@@ -91,27 +91,47 @@ fn waves(longest: f64, strength: f64, seconds: f64, eye: DVec2) -> [[f32; 4]; WA
 /// A picture between two passes.
 struct Sheet {
     size: [u32; 2],
+    samples: u32,
     colour: wgpu::TextureView,
+    /// What is drawn to where there are several samples a pixel: `colour` is their mean.
+    sampled: Option<wgpu::TextureView>,
     depth: wgpu::TextureView,
 }
 
 impl Sheet {
-    fn new(device: &wgpu::Device, label: &str, size: [u32; 2]) -> Self {
-        let view = |format| {
+    fn new(device: &wgpu::Device, label: &str, size: [u32; 2], samples: u32) -> Self {
+        let view = |format, samples| {
             let [width, height] = size;
+            let read = if samples == 1 {
+                wgpu::TextureUsages::TEXTURE_BINDING
+            } else {
+                wgpu::TextureUsages::empty()
+            };
             let texture = device.create_texture(&wgpu::TextureDescriptor {
                 label: Some(label),
                 size: wgpu::Extent3d { width, height, depth_or_array_layers: 1 },
                 mip_level_count: 1,
-                sample_count: 1,
+                sample_count: samples,
                 dimension: wgpu::TextureDimension::D2,
                 format,
-                usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::TEXTURE_BINDING,
+                usage: wgpu::TextureUsages::RENDER_ATTACHMENT | read,
                 view_formats: &[],
             });
             texture.create_view(&wgpu::TextureViewDescriptor::default())
         };
-        Self { size, colour: view(TARGET.format), depth: view(DEPTH) }
+        Self {
+            size,
+            samples,
+            colour: view(FORMAT, 1),
+            sampled: (samples > 1).then(|| view(FORMAT, samples)),
+            depth: view(DEPTH, samples),
+        }
+    }
+
+    /// Bytes of GPU memory: four a pixel of colour, and of each sample four of depth and, where there are several, of colour.
+    fn bytes(&self) -> u64 {
+        let of_samples = u64::from(self.samples) * if self.sampled.is_some() { 8 } else { 4 };
+        self.size.map(u64::from).iter().product::<u64>() * (4 + of_samples)
     }
 }
 
@@ -123,6 +143,61 @@ struct Mirror {
     group: wgpu::BindGroup,
 }
 
+impl Mirror {
+    /// `scene`: what is seen through.
+    fn new(
+        renderer: &Renderer,
+        layout: &wgpu::BindGroupLayout,
+        [smooth, exact]: [&wgpu::Sampler; 2],
+        sheet: Sheet,
+        scene: &Sheet,
+    ) -> Self {
+        let device = &renderer.device;
+        let uniform = device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("water"),
+            size: size_of::<WaterUniform>() as u64,
+            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        let view = |binding, view| wgpu::BindGroupEntry {
+            binding,
+            resource: wgpu::BindingResource::TextureView(view),
+        };
+        let sampler = |binding, sampler| wgpu::BindGroupEntry {
+            binding,
+            resource: wgpu::BindingResource::Sampler(sampler),
+        };
+        let group = device.create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some("water"),
+            layout,
+            entries: &[
+                wgpu::BindGroupEntry { binding: 0, resource: uniform.as_entire_binding() },
+                sampler(1, smooth),
+                view(2, &sheet.colour),
+                view(3, &scene.colour),
+                view(4, &scene.depth),
+                sampler(5, exact),
+            ],
+        });
+        Self { lens: Lens::new(device, &renderer.groups), sheet, uniform, group }
+    }
+}
+
+/// What draws land, and the sky behind it.
+type Scenery = (Pipelines, wgpu::RenderPipeline);
+
+fn scenery(renderer: &Renderer, mode: Mode, samples: u32) -> Scenery {
+    let (device, target) = (&renderer.device, Target { format: FORMAT, samples });
+    let terrain = terrain_pipelines(device, target, &renderer.terrain_groups(), mode);
+    (terrain, sky_pipeline(device, target, &renderer.groups[0]))
+}
+
+/// Samples a pixel of what is mirrored. Outlines in still water are seen as those of the picture are; waves make them soft by
+/// themselves, and four samples take a software renderer a quarter to a half longer.
+fn mirror_samples(renderer: &Renderer, look: &Look) -> u32 {
+    if look.water.waves > 0.0 { 1 } else { renderer.options.samples }
+}
+
 /// All that water takes, made when it is first seen.
 pub(super) struct WaterPasses {
     layout: wgpu::BindGroupLayout,
@@ -130,10 +205,9 @@ pub(super) struct WaterPasses {
     exact_sampler: wgpu::Sampler,
     /// To the picture.
     surfaces: Pipelines,
-    /// To the textures: what is mirrored, what is seen through, and the sky.
-    mirrored: Pipelines,
-    through: Pipelines,
-    sky: wgpu::RenderPipeline,
+    /// To the textures: what is mirrored, by samples a pixel, and what is seen through.
+    mirrored: BTreeMap<u32, Scenery>,
+    through: Scenery,
     scene: Sheet,
     scene_lens: Lens,
     /// By layer.
@@ -188,13 +262,12 @@ impl WaterPasses {
             })
         };
         let [frame, layer] = &renderer.groups;
-        let terrain = |mode| terrain_pipelines(device, TARGET, &renderer.terrain_groups(), mode);
         Self {
             surfaces: terrain_pipelines(device, renderer.target(), &[frame, layer, &layout], Mode::Water),
-            mirrored: terrain(Mode::Mirrored),
-            through: terrain(Mode::Filled),
-            sky: sky_pipeline(device, TARGET, frame),
-            scene: Sheet::new(device, "seen through water", size),
+            mirrored: BTreeMap::new(),
+            // Its depth is read, which WebGL2 cannot of several samples.
+            through: scenery(renderer, Mode::Filled, 1),
+            scene: Sheet::new(device, "seen through water", size, 1),
             scene_lens: Lens::new(device, &renderer.groups),
             mirrors: BTreeMap::new(),
             layout,
@@ -203,10 +276,10 @@ impl WaterPasses {
         }
     }
 
-    /// Bytes of GPU memory that its pictures take: four a pixel of colour, and four of depth.
+    /// Bytes of GPU memory that its pictures take.
     pub(super) fn bytes(&self) -> u64 {
         let sheets = self.mirrors.values().map(|mirror| &mirror.sheet).chain([&self.scene]);
-        sheets.map(|sheet| 8 * sheet.size.map(u64::from).iter().product::<u64>()).sum()
+        sheets.map(Sheet::bytes).sum()
     }
 
     /// Draws what the layers of water in view mirror, and what is seen through them. `water` is sorted by layer.
@@ -224,7 +297,7 @@ impl WaterPasses {
     ) {
         let device = &renderer.device;
         if self.scene.size != camera.size {
-            self.scene = Sheet::new(device, "seen through water", camera.size);
+            self.scene = Sheet::new(device, "seen through water", camera.size, 1);
             self.mirrors.clear();
         }
         let is_land = |item: &DrawItem| !is_water(layers, item, look);
@@ -233,17 +306,7 @@ impl WaterPasses {
         let view = View::straight(camera);
         let land = renderer.in_view(layers, &view, items, look, is_land);
         let near = self.scene_lens.write(renderer, layers, &view, &clear, &land, false);
-        draw_sheet(
-            renderer,
-            encoder,
-            &self.scene,
-            &self.scene_lens,
-            look,
-            &land,
-            &self.through,
-            &self.sky,
-            stats,
-        );
+        draw_sheet(renderer, encoder, &self.scene, &self.scene_lens, look, &land, &self.through, stats);
 
         let scale = look.water.mirror_scale.clamp(1e-3, 1.0);
         #[allow(
@@ -265,10 +328,16 @@ impl WaterPasses {
                 self.mirrors.insert(number, mirror);
             }
         }
+        let samples = mirror_samples(renderer, look);
+        let mirrored =
+            self.mirrored.entry(samples).or_insert_with(|| scenery(renderer, Mode::Mirrored, samples));
         for (number, draws) in of_layer {
             let layer = &layers[number];
-            if self.mirrors.get(&number).is_none_or(|mirror| mirror.sheet.size != size) {
-                let mirror = self.mirror(renderer, size);
+            let fits = |mirror: &Mirror| mirror.sheet.size == size && mirror.sheet.samples == samples;
+            if !self.mirrors.get(&number).is_some_and(fits) {
+                let sheet = Sheet::new(device, "mirrored", size, samples);
+                let samplers = [&self.smooth_sampler, &self.exact_sampler];
+                let mirror = Mirror::new(renderer, &self.layout, samplers, sheet, &self.scene);
                 self.mirrors.insert(number, mirror);
             }
             let Some(mirror) = self.mirrors.get_mut(&number) else { continue };
@@ -286,50 +355,8 @@ impl WaterPasses {
             let items = told.map_or(items, |told| &told.items);
             let land = renderer.in_view(layers, &view, items, look, is_land);
             mirror.lens.write(renderer, layers, &view, look, &land, false);
-            draw_sheet(
-                renderer,
-                encoder,
-                &mirror.sheet,
-                &mirror.lens,
-                look,
-                &land,
-                &self.mirrored,
-                &self.sky,
-                stats,
-            );
+            draw_sheet(renderer, encoder, &mirror.sheet, &mirror.lens, look, &land, mirrored, stats);
         }
-    }
-
-    fn mirror(&self, renderer: &Renderer, size: [u32; 2]) -> Mirror {
-        let device = &renderer.device;
-        let sheet = Sheet::new(device, "mirrored", size);
-        let uniform = device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some("water"),
-            size: size_of::<WaterUniform>() as u64,
-            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
-        let view = |binding, view| wgpu::BindGroupEntry {
-            binding,
-            resource: wgpu::BindingResource::TextureView(view),
-        };
-        let sampler = |binding, sampler| wgpu::BindGroupEntry {
-            binding,
-            resource: wgpu::BindingResource::Sampler(sampler),
-        };
-        let group = device.create_bind_group(&wgpu::BindGroupDescriptor {
-            label: Some("water"),
-            layout: &self.layout,
-            entries: &[
-                wgpu::BindGroupEntry { binding: 0, resource: uniform.as_entire_binding() },
-                sampler(1, &self.smooth_sampler),
-                view(2, &sheet.colour),
-                view(3, &self.scene.colour),
-                view(4, &self.scene.depth),
-                sampler(5, &self.exact_sampler),
-            ],
-        });
-        Mirror { lens: Lens::new(device, &renderer.groups), sheet, uniform, group }
     }
 
     /// Draws the surfaces themselves, in the picture's pass.
@@ -362,18 +389,17 @@ fn draw_sheet(
     lens: &Lens,
     look: &Look,
     land: &[Draw<'_>],
-    pipelines: &Pipelines,
-    sky: &wgpu::RenderPipeline,
+    (pipelines, sky): &Scenery,
     stats: &mut FrameStats,
 ) {
     let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
         label: Some("water"),
         color_attachments: &[Some(wgpu::RenderPassColorAttachment {
-            view: &sheet.colour,
+            view: sheet.sampled.as_ref().unwrap_or(&sheet.colour),
             depth_slice: None,
-            resolve_target: None,
+            resolve_target: sheet.sampled.is_some().then_some(&sheet.colour),
             ops: wgpu::Operations {
-                load: wgpu::LoadOp::Clear(clear_colour(look, TARGET.format)),
+                load: wgpu::LoadOp::Clear(clear_colour(look, FORMAT)),
                 store: wgpu::StoreOp::Store,
             },
         })],

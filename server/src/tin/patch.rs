@@ -313,12 +313,12 @@ fn keeps(forest: &Forest, d: Diamond, ground: Ground<'_>, rules: &Rules) -> bool
 /// square, there is no gap, and no vertex has flat surroundings.
 fn stays(forest: &Forest, d: Diamond, ground: Ground<'_>, rules: &Rules) -> bool {
     let square = square(forest, d);
+    let vertices = || points(forest, d, square).map(|[x, y]| Vertex { x, y, height: ground.at(x, y) });
+    let may_go = |v: &Vertex| ground.may_be_plane(*v) && square.role(*v) != Role::Locked;
+    // First without any gap: surroundings are of heights.
     square.upper.is_some()
-        && points(forest, d, square).all(|[x, y]| {
-            let v = Vertex { x, y, height: ground.at(x, y) };
-            let may_go = || ground.may_be_plane(v) && square.role(v) != Role::Locked;
-            v.height != NODATA && !(may_go() && is_flat(v, ground, rules))
-        })
+        && vertices().all(|v| v.height != NODATA)
+        && !vertices().filter(may_go).any(|v| is_flat(v, ground, rules))
 }
 
 /// The mesh of a diamond all of whose children have the source's own, if that is left as it is where nothing may be lost.

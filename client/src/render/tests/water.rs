@@ -187,3 +187,54 @@ fn water_is_drawn_from_below_plain_and_as_wires() {
     assert!(again.is_ok());
     assert_eq!(offscreen.read().unwrap(), pictures[1]);
 }
+
+#[test]
+fn outlines_in_the_mirror_are_as_smooth_as_those_of_the_picture() {
+    let shore = Shore::new(0.0, |x, y| if (20..=40).contains(&x) && y > 30 { 600 } else { NODATA });
+    let camera = Camera {
+        eye: shore.land.place(0.4, 0.05, 60.0),
+        target: shore.land.place(0.55, 0.5, 0.0),
+        fov_y: FOV_Y,
+        size: [320, 240],
+    };
+    // Of grey land over magenta: green tells how much of a pixel it takes.
+    let look = Look { colours: Colours::Flat, ..PLAIN };
+    let mirror = Look { water: Water { refractive_index: 1e12, ..CALM }, ..look };
+    let plain = Look { water: Water { reflecting: false, ..CALM }, ..look };
+    let with_flat = shore.picture(&camera, &shore.items, &plain, 1);
+    let without = shore.picture(&camera, &shore.land_items(), &plain, 1);
+    let is_water = |x: u32, y: u32| with_flat.pixel([x, y]) != without.pixel([x, y]);
+    let is_inside = |[x, y]: [u32; 2]| (x - 1..=x + 1).all(|x| (y - 1..=y + 1).all(|y| is_water(x, y)));
+    let inside: Vec<_> =
+        (1..239).flat_map(|y| (1..319).map(move |x| [x, y])).filter(|p| is_inside(*p)).collect();
+    let mixed = [1, 4].map(|samples| {
+        let picture = shore.picture(&camera, &shore.items, &mirror, samples);
+        inside.iter().filter(|p| (15..180).contains(&picture.pixel(**p).unwrap()[1])).count()
+    });
+    assert!(inside.len() > 10_000 && mixed[0] < 10 && mixed[1] > 50, "{mixed:?} of {}", inside.len());
+}
+
+/// Where what is seen through jumped by a pixel, beds had contours that were none of theirs.
+#[test]
+fn an_even_bed_has_no_contours() {
+    let shore = Shore::new(0.0, |x, y| -60 - i32::try_from(2 * x + y).unwrap());
+    let camera = Camera {
+        eye: shore.land.place(0.5, 0.1, 40.0),
+        target: shore.land.place(0.5, 0.6, 0.0),
+        fov_y: FOV_Y,
+        size: [200, 300],
+    };
+    let look = Look {
+        water: Water { clarity: Some(8.0), ..CALM },
+        background: Background::Colour([1.0; 4]),
+        colours: Colours::Flat,
+        ..PLAIN
+    };
+    let picture = shore.picture(&camera, &shore.items, &look, 1);
+    for x in [60, 100, 140] {
+        let green = |y: u32| i32::from(picture.pixel([x, y]).unwrap()[1]);
+        let bends = (140..290).map(|y| (green(y - 1) - 2 * green(y) + green(y + 1)).abs());
+        let most = bends.max().unwrap();
+        assert!(most <= 3, "{most}: {:?}", (140..290).map(green).collect::<Vec<_>>());
+    }
+}
