@@ -111,7 +111,7 @@ def measure(port, pids, script, options):
     count = int(re.search(r"(\d+) requests in", out).group(1))
     if "Non-2xx" in out or "Socket errors" in out:
         sys.exit(f"bench-serve: answers failed:\n{out}")
-    p99 = seconds(re.search(r"99%\s+(\S+)", out).group(1))
+    p99 = seconds(re.search(r"^\s+99%\s+(\S+)", out, re.MULTILINE).group(1))
     return count / took, used / count, p99
 
 

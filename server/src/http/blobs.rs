@@ -227,7 +227,7 @@ mod tests {
         let blobs = Blobs::new(8 << 20, Files::new(), Arc::new(Metrics::new(Arc::default())));
         let cache = blobs.cache.as_ref().unwrap();
         for number in 0..5000 {
-            cache.insert(name(number), Bytes::from(vec![0; 10_000]).into());
+            cache.insert(name(number), Bytes::from(vec![0; 20_000]).into());
             assert!(
                 blobs.filed(name(number)).is_none_or(|blob| blob.filed.is_some() == blobs.files.is_some())
             );
