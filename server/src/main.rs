@@ -31,11 +31,6 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::signal::unix::{SignalKind, signal};
 
-/// Answers are made of many small pieces, and builds of many lists: they take 2 to 8 % less of the processor than with
-/// the system's allocator.
-#[global_allocator]
-static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
-
 /// The exit code of a build that was asked to stop.
 const INTERRUPTED: u8 = 130;
 
