@@ -80,7 +80,7 @@ const MORPH_SECONDS: f64 = 0.3;
 const MESSAGE_POINTS: f32 = 26.0;
 
 /// The width of a window, in points, that has room for the panel beside the ground.
-const NARROW_POINTS: f32 = 500.0;
+const NARROW_POINTS: f32 = 450.0;
 
 /// Pixels by which the panel has to change for the view that it lies beside to do so.
 const COVERED_MORE: u32 = 40;
