@@ -47,13 +47,12 @@ fn wave_slope(across: vec2<f32>, right: vec2<f32>, down: vec2<f32>) -> vec3<f32>
     var shortest = 0.0;
     for (var i = 0; i < 10; i++) {
         let wave = water.waves[i];
-        // Radians of the wave that a pixel covers: beyond pi its samples show another wave. They are gone long before: from
-        // afar the longest alone would be left, as stripes.
+        // Radians of the wave that a pixel covers: beyond pi its samples show another wave.
         let step = max(abs(dot(wave.xy, right)), abs(dot(wave.xy, down)));
-        let seen = 1.0 - smoothstep(0.12, 0.6, step);
+        let seen = 1.0 - smoothstep(0.3, 1.2, step);
         let along = wave.xy / length(wave.xy) * (wave.w * seen * cos(dot(wave.xy, across) + wave.z));
         slope += vec3<f32>(along, 0.25 * wave.w * wave.w * (1.0 - seen * seen));
-        shortest = max(shortest, smoothstep(0.3, 1.2, step));
+        shortest = max(shortest, 1.0 - seen);
     }
     return slope + vec3<f32>(0.0, 0.0, mix(RIPPLES.x, RIPPLES.y, shortest));
 }
