@@ -319,15 +319,7 @@ impl Viewer {
         ui.ctx().options_mut(|options| options.input_options.max_double_click_delay = delay);
         self.steer(ui, seconds.min(STEP_SECONDS));
         self.controls.step(seconds.min(STEP_SECONDS));
-        let eye = self.camera().eye;
-        let ground = self.picker.ground(
-            &self.terrain.scene().layers,
-            &self.frame.items,
-            self.look.exaggeration,
-            eye.truncate(),
-        );
-        // Beside the ground, where nothing is to be seen from below.
-        let ground = ground.unwrap_or_else(|| self.bounds().min.z);
+        let ground = self.ground();
         self.controls.stay_above(ground, CLEARANCE_CELLS * self.cell());
         let (reloads, is_replaced) = (self.frame.stats.reloads, self.terrain.scene_changed());
         self.terrain.set_wires(self.look.wireframe);
@@ -526,12 +518,7 @@ impl Viewer {
         });
         let [right, ahead, up, turn, tilt] = held;
         if held != [0.0; 5] {
-            let camera = self.camera();
-            let (eye, cell) = (camera.eye, self.cell());
-            let layers = &self.terrain.scene().layers;
-            let ground =
-                self.picker.ground(layers, &self.frame.items, self.look.exaggeration, eye.truncate());
-            let height = (eye.z - ground.unwrap_or(self.camera().target.z)).abs().max(5.0 * cell);
+            let height = (self.camera().eye.z - self.ground()).abs().max(5.0 * self.cell());
             self.controls.fly(&Thrust { right, ahead, up, fast }, height, seconds);
             if [turn, tilt] != [0.0; 2] {
                 let by = TURN_PER_SECOND * seconds;
@@ -622,10 +609,11 @@ impl Viewer {
         self.asks.push(Ask::Screenshot(path));
     }
 
-    /// The ground in the middle of the picture stays there, and as far away.
+    /// The ground in the middle of the picture stays there, and as far away; where that is the sky, the ground below the eye.
     fn set_exaggeration(&mut self, exaggeration: f64) {
         let by = exaggeration / self.look.exaggeration;
-        let ground = self.reach(self.middle()).z;
+        let ground = self.pivot(self.middle()).map(|point| point.z);
+        let ground = ground.unwrap_or_else(|| self.ground());
         self.look.exaggeration = exaggeration;
         self.terrain.set_exaggeration(exaggeration);
         self.controls.lift(ground * (by - 1.0));

@@ -7,16 +7,15 @@ use super::Viewer;
 use crate::camera::Bounds;
 use crate::controls;
 use crate::overview;
-use glam::DVec2;
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 
 /// How far away the level beside the ground may be met, in distances to the ground: it goes on for ever.
 const LEVEL_MAX: f64 = 4.0;
 
 impl Viewer {
-    /// The box around what is shown, stretched as it is drawn.
+    /// The box around the scene, stretched as it is drawn.
     pub(super) fn bounds(&self) -> Bounds {
-        let [min, max] = overview::extent(&self.terrain.shown_scene());
+        let [min, max] = overview::extent(self.terrain.scene());
         Bounds { min, max }.stretched(self.look.exaggeration)
     }
 
@@ -30,6 +29,14 @@ impl Viewer {
         let along = (self.bounds().min.z - camera.eye.z) / ray.z;
         let is_met = along.is_finite() && along > 0.0 && along <= LEVEL_MAX * self.away();
         is_met.then(|| camera.eye + ray * along)
+    }
+
+    /// The height of the ground below the eye, stretched as it is drawn; beside it, that of the lowest.
+    pub(super) fn ground(&mut self) -> f64 {
+        let (layers, exaggeration) = (&self.terrain.scene().layers, self.look.exaggeration);
+        let eye = self.controls.camera().eye.truncate();
+        let ground = self.picker.ground(layers, &self.frame.items, exaggeration, eye);
+        ground.unwrap_or_else(|| self.bounds().min.z)
     }
 
     /// What to go towards at a place of the picture, in pixels.

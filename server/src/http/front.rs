@@ -117,7 +117,11 @@ impl Front {
         if let Some(Cause(cause)) = response.extensions_mut().remove() {
             tracing::error!(id = ended.id, path = ended.path, %cause, "store");
         }
-        if let Some(filed) = response.extensions_mut().remove() {
+        let filed = response.extensions_mut().remove();
+        // Answers without a body never take it off.
+        if let Some(filed) =
+            filed.filter(|_| ended.method != Method::HEAD && response.status() == StatusCode::OK)
+        {
             connection.outbox.expect(filed);
         }
         ended.route = response.extensions_mut().remove().map_or(NO_ROUTE, |Route(template)| template);
