@@ -64,7 +64,7 @@ pub(super) fn show(viewer: &mut Viewer, ui: &mut Ui) {
     if !viewer.panel_is_open {
         let corner = Area::new(ui.scope_id().with("open panel")).anchor(Align2::RIGHT_TOP, [-10.0, 10.0]);
         corner.show(ui.ctx(), |ui| {
-            if ui.button("☰").on_hover_text("The panel: Tab").clicked() {
+            if ui.button("Panel").on_hover_text("Tab").clicked() {
                 viewer.open_panel(true);
             }
         });
@@ -103,7 +103,7 @@ fn scene(viewer: &mut Viewer, ui: &mut Ui) {
     ui.horizontal(|ui| {
         ui.heading(name);
         ui.with_layout(egui::Layout::right_to_left(egui::Align::Center), |ui| {
-            if ui.button("☰").on_hover_text("Hide the panel: Tab").clicked() {
+            if ui.button("Hide").on_hover_text("The panel: Tab").clicked() {
                 viewer.open_panel(false);
             }
         });
