@@ -425,14 +425,13 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
             terrain.problem().unwrap_or("the data did not arrive in time; wait longer with --timeout")
         }
     };
-    Err(Failure(
-        1,
-        format!(
-            "{}: written, but its largest error is {:.2} pixels: {why}",
-            args.output.display(),
-            report.largest_error_pixels
-        ),
-    ))
+    let what = if report.asked_error_reached {
+        // A tile of imagery, say.
+        "not all of it arrived".to_owned()
+    } else {
+        format!("its largest error is {:.2} pixels", report.largest_error_pixels)
+    };
+    Err(Failure(1, format!("{}: written, but {what}: {why}", args.output.display())))
 }
 
 fn print_report(args: &RenderArgs, r: &PictureReport) -> std::io::Result<()> {

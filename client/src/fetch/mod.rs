@@ -382,10 +382,14 @@ impl Fetcher {
         self.shared.fail(&mut state, &[key], error);
     }
 
-    /// Whether all that is wished for has failed too often and rests.
+    /// Whether all that is wished for has failed too often and rests, and every event of it has been taken: who stops
+    /// waiting knows why.
     #[must_use]
     pub fn is_stuck(&self) -> bool {
         let state = self.shared.lock();
+        if state.serial != self.seen {
+            return false;
+        }
         let rests = |want: &Want| state.failures.get(&want.key).is_some_and(|f| f.tries >= TRIES_MAX);
         state.flights.is_empty()
             && state.streams.is_empty()

@@ -59,8 +59,8 @@ pub(super) struct State {
     pub(super) away: Option<String>,
     /// When the first of the requests failed that have not reached the server.
     pub(super) silent_since: Option<Instant>,
-    /// Events and requests so far.
-    serial: u64,
+    /// Events sent so far.
+    pub(super) serial: u64,
     flight: u64,
     stopped: bool,
 }
