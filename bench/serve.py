@@ -1,8 +1,13 @@
 """How many requests a server answers, beside nginx with the same blobs as files: `scripts/bench-serve`.
 
 One after the other, several rounds, in one run: each server alone with wrk, over loopback, with connections kept alive.
-Of each server: requests a second, microseconds of its processor time a request, the 99th percentile of latencies. The
-best round counts, since others share the machine.
+Of each server, the median round's requests a second, microseconds of its processor time a request, and 99th percentile of
+latencies: as fast as it can, when the faster server also has the busier machine, and where each connection rests for 1 ms
+after each answer, which is about the same load for all.
+
+nginx is asked twice, since its workers take connections from one queue as they are awake: in some rounds one worker has
+nearly all of them, and the other leaves its core to wrk. With `reuseport` the system deals them out. The busiest worker's
+part of the processor time tells which it was.
 """
 
 import argparse
@@ -10,6 +15,7 @@ import os
 import re
 import signal
 import socket
+import statistics
 import subprocess
 import sys
 import time
@@ -25,6 +31,13 @@ end
 function request()
     next = next % #requests + 1
     return requests[next]
+end
+"""
+
+# After each answer, on each connection, in milliseconds.
+RESTED = LUA + """
+function delay()
+    return 1
 end
 """
 
@@ -51,6 +64,7 @@ http {
     scgi_temp_path FOLDER/scgi;
     server {
         listen 127.0.0.1:PORT;
+        listen 127.0.0.1:DEALT reuseport;
         root FOLDER/files;
         etag on;
         add_header Cache-Control "public, max-age=31536000, immutable";
@@ -76,25 +90,22 @@ def wait_for(port):
     sys.exit(f"bench-serve: nothing listens on port {port}")
 
 
-def family(pid):
-    """A process and its children."""
-    pids = [pid]
+def workers(pid):
+    """Where the processor times of what serves connections are told: a process's children, or its threads."""
+    found = []
     for other in filter(str.isdigit, os.listdir("/proc")):
         try:
             fields = open(f"/proc/{other}/stat").read().rsplit(")", 1)[1].split()
         except OSError:
             continue
         if int(fields[1]) == pid:
-            pids.append(int(other))
-    return pids
+            found.append(f"/proc/{other}/stat")
+    return found or [f"/proc/{pid}/task/{thread}/stat" for thread in os.listdir(f"/proc/{pid}/task")]
 
 
-def cpu_seconds(pids):
-    ticks = 0
-    for pid in pids:
-        fields = open(f"/proc/{pid}/stat").read().rsplit(")", 1)[1].split()
-        ticks += int(fields[11]) + int(fields[12])
-    return ticks / os.sysconf("SC_CLK_TCK")
+def cpu_seconds(stats):
+    ticks = [sum(map(int, open(stat).read().rsplit(")", 1)[1].split()[11:13])) for stat in stats]
+    return [t / os.sysconf("SC_CLK_TCK") for t in ticks]
 
 
 def seconds(text):
@@ -102,72 +113,91 @@ def seconds(text):
     return float(number) * {"us": 1e-6, "ms": 1e-3, "s": 1.0, "m": 60.0}[unit]
 
 
-def measure(port, pids, script, options):
-    """One round: requests a second, processor seconds a request, the 99th percentile, bytes a second."""
+def measure(port, stats, script, options):
+    """One round: requests a second, processor seconds a request, the 99th percentile, the busiest worker's part."""
     command = ["wrk", "-t1", f"-c{options.connections}", f"-d{options.seconds}s", "--latency", "-s", script]
-    before, started = cpu_seconds(pids), time.monotonic()
+    before, started = cpu_seconds(stats), time.monotonic()
     out = subprocess.run(command + [f"http://127.0.0.1:{port}"], capture_output=True, text=True, check=True).stdout
-    used, took = cpu_seconds(pids) - before, time.monotonic() - started
+    used = [after - first for first, after in zip(before, cpu_seconds(stats))]
+    took = time.monotonic() - started
     count = int(re.search(r"(\d+) requests in", out).group(1))
     if "Non-2xx" in out or "Socket errors" in out:
         sys.exit(f"bench-serve: answers failed:\n{out}")
     p99 = seconds(re.search(r"^\s+99%\s+(\S+)", out, re.MULTILINE).group(1))
-    return count / took, used / count, p99
+    return count / took, sum(used) / count, p99, max(used) / sum(used)
+
+
+def medians(rounds):
+    return [statistics.median(values) for values in zip(*rounds)]
+
+
+def script_of(text, folder, name, paths):
+    script = f"{folder}/{name}.lua"
+    with open(script, "w") as f:
+        f.write(text.replace("PATHS", f"{folder}/{paths}.paths"))
+    return script
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", help="what the example `blobs` has made")
     parser.add_argument("server", help="the program diamantina-server")
-    parser.add_argument("--seconds", type=int, default=4, help="of a round")
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=int, default=2, help="of a round")
+    parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--connections", type=int, default=32)
     options = parser.parse_args()
     folder = os.path.abspath(options.folder)
-    ports = {"nginx": free_port(), "diamantina": free_port()}
+    ports = {name: free_port() for name in ("nginx", "nginx, reuseport", "diamantina")}
     with open(f"{folder}/nginx.conf", "w") as f:
-        f.write(NGINX.replace("FOLDER", folder).replace("PORT", str(ports["nginx"])))
+        config = NGINX.replace("FOLDER", folder).replace("PORT", str(ports["nginx"]))
+        f.write(config.replace("DEALT", str(ports["nginx, reuseport"])))
     stores = [f"{folder}/stores/{size}" for size in SIZES]
     quiet = {"stdout": subprocess.DEVNULL}
     address = f"127.0.0.1:{ports['diamantina']}"
-    servers = {
-        "nginx": subprocess.Popen(["nginx", "-c", f"{folder}/nginx.conf"], **quiet),
-        "diamantina": subprocess.Popen([options.server, "serve", *stores, "--listen", address], **quiet),
-    }
+    nginx = subprocess.Popen(["nginx", "-c", f"{folder}/nginx.conf"], **quiet)
+    diamantina = subprocess.Popen([options.server, "serve", *stores, "--listen", address], **quiet)
     try:
         for port in ports.values():
             wait_for(port)
-        pids = {name: family(server.pid) for name, server in servers.items()}
-        print("| blobs | server | requests/s | CPU a request | p99 | of nginx's: requests/s, CPU, p99 |")
-        print("|---|---|---|---|---|---|")
-        rates = {}
+        of = {name: workers((diamantina if name == "diamantina" else nginx).pid) for name in ports}
+        print("| blobs | server | requests/s | CPU a request | p99 | p99 at equal load | busiest worker |")
+        print("|---|---|---|---|---|---|---|")
+        rates, lines = {}, []
         for size in SIZES:
-            script = f"{folder}/{size}.lua"
-            with open(script, "w") as f:
-                f.write(LUA.replace("PATHS", f"{folder}/{size}.paths"))
-            rounds = {name: [] for name in servers}
+            scripts = [script_of(LUA, folder, size, size), script_of(RESTED, folder, f"{size}.rested", size)]
+            rounds = {name: ([], []) for name in ports}
             for _ in range(options.rounds):
-                for name in servers:
-                    rounds[name].append(measure(ports[name], pids[name], script, options))
-            best = {n: (max(r[0] for r in rs), min(r[1] for r in rs), min(r[2] for r in rs)) for n, rs in rounds.items()}
-            rates[size] = best["diamantina"][0]
-            for name, (rate, cpu, p99) in best.items():
-                to_nginx = ", ".join(f"{a / b:.2f}" for a, b in zip(best[name], best["nginx"]))
-                print(f"| {size} | {name} | {rate:.0f} | {cpu * 1e6:.1f} us | {p99 * 1e3:.2f} ms | {to_nginx} |")
+                for name, port in ports.items():
+                    for script, found in zip(scripts, rounds[name]):
+                        found.append(measure(port, of[name], script, options))
+            found = {}
+            for name, (fast, rested) in rounds.items():
+                (rate, cpu, p99, _), rested_p99 = medians(fast), medians(rested)[2]
+                found[name] = (rate, cpu, p99, rested_p99)
+                parts = sorted(part for *_, part in fast)
+                print(
+                    f"| {size} | {name} | {rate:.0f} | {cpu * 1e6:.1f} us | {p99 * 1e3:.2f} ms | {rested_p99 * 1e3:.2f} ms"
+                    f" | {parts[0]:.2f} to {parts[-1]:.2f} |",
+                    flush=True,
+                )
+            rates[size] = found["diamantina"][0]
+            for other in ("nginx", "nginx, reuseport"):
+                ratios = [f"{a / b:.2f}" for a, b in zip(found["diamantina"], found[other])]
+                lines.append(f"| {size} | {other} | {' | '.join(ratios)} |")
+        print("\n| blobs | diamantina to | requests/s | CPU a request | p99 | p99 at equal load |\n|---|---|---|---|---|---|")
+        print("\n".join(lines))
         print("\n| blobs | diamonds a batch | batches/s | diamonds/s | of single requests' |\n|---|---|---|---|---|")
         for size in SIZES:
             lines = [line.split(" ", 1) for line in open(f"{folder}/{size}.batches").read().splitlines()]
             with open(f"{folder}/{size}.batch.paths", "w") as f:
                 f.writelines(route + "\n" for _, route in lines)
-            script = f"{folder}/{size}.batch.lua"
-            with open(script, "w") as f:
-                f.write(LUA.replace("PATHS", f"{folder}/{size}.batch.paths"))
+            script = script_of(LUA, folder, f"{size}.batch", f"{size}.batch")
             mean = sum(int(count) for count, _ in lines) / len(lines)
-            found = [measure(ports["diamantina"], pids["diamantina"], script, options) for _ in range(options.rounds)]
-            rate = max(r[0] for r in found)
-            print(f"| {size} | {mean:.0f} | {rate:.0f} | {rate * mean:.0f} | {rate * mean / rates[size]:.1f} |")
+            one = "diamantina"
+            rate = medians([measure(ports[one], of[one], script, options) for _ in range(options.rounds)])[0]
+            print(f"| {size} | {mean:.0f} | {rate:.0f} | {rate * mean:.0f} | {rate * mean / rates[size]:.1f} |", flush=True)
     finally:
-        for server in servers.values():
+        for server in (nginx, diamantina):
             server.send_signal(signal.SIGTERM)
             server.wait(30)
 

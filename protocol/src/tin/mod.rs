@@ -421,11 +421,14 @@ fn receive<const LANE: usize>(
     bytes: usize,
 ) -> Result<Patch, DecodeError> {
     let units = Units { shift: 0, base: 0, step: 1 }.pass(&mut receiver)?;
+    if units.step < 1 {
+        return Err(DecodeError::Symbols);
+    }
     if flags & LATTICE != 0 {
         return receive_lattice(forest, d, units, receiver);
     }
     let square = Square::new(forest, d, units.shift);
-    if square.is_empty() || units.step < 1 {
+    if square.is_empty() {
         return Err(DecodeError::Symbols);
     }
     // More are found at less than four bits each.
