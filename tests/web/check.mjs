@@ -76,11 +76,11 @@ async function compare(page, pictures) {
 const state = (page) => page.evaluate(() => window.diamantina?.state());
 
 /// Waits until all that is asked for is drawn and stands still.
-async function settled(page) {
+async function settled(page, pixels = ERROR_PIXELS) {
     const until = Date.now() + PATIENCE;
     for (;;) {
         const now = await state(page).catch(() => null);
-        if (now?.complete && now.moving === 0 && now.error_pixels <= ERROR_PIXELS) return now;
+        if (now?.complete && now.moving === 0 && now.error_pixels <= pixels) return now;
         const said = await page.locator('#message').textContent();
         check(Date.now() < until, `not settled: ${JSON.stringify(now)}; the page says: ${said}`);
         await page.waitForTimeout(100);
@@ -212,6 +212,72 @@ async function imagery(page, blank, graphics) {
     return `imagery ${beside.mean.toFixed(2)}`;
 }
 
+/// Fingers on a screen that has no mouse: what one takes hold of stays under it, two apart go nearer, a tap asks for the height.
+async function touch(browser, graphics) {
+    const context = await browser.newContext({ viewport: SIZE, deviceScaleFactor: 1, hasTouch: true });
+    const page = await context.newPage();
+    const devices = await context.newCDPSession(page);
+    const finger = async (type, ...points) => {
+        const touchPoints = points.map(([x, y], id) => ({ x, y, id, radiusX: 5, radiusY: 5, force: 1 }));
+        await devices.send('Input.dispatchTouchEvent', { type, touchPoints });
+        // The browser merges what moves between two frames.
+        if (type === 'touchMove') await frames(page, 2);
+    };
+    let known = [null, null];
+    const tap = async (point) => {
+        await finger('touchStart', point);
+        await finger('touchEnd');
+        // Two at most are kept.
+        const place = await page.waitForFunction(([u, v]) => {
+            const { marks } = window.diamantina.state();
+            const last = marks.at(-1)?.[0];
+            return last && (last[0] !== u || last[1] !== v) && last;
+        }, known, { timeout: PATIENCE });
+        known = await place.jsonValue();
+        return known;
+    };
+    const pixels = 4 * ERROR_PIXELS;
+    const away = ([x, y, z], [u, v, w]) => Math.hypot(x - u, y - v, z - w);
+    /// Where the eye comes to rest: what fingers began goes on for a while.
+    const eye = async () => {
+        for (let before; ;) {
+            const { view } = await settled(page, pixels);
+            if (view === before) return view.split(',').slice(0, 3).map(Number);
+            before = view;
+            await frames(page, 5);
+        }
+    };
+    const steps = [1, 2, 3, 4, 5, 6];
+
+    await page.goto(`${url}/?scene=hills&error=${pixels}${graphics === 'webgl' ? '&graphics=webgl' : ''}${hash(VIEW)}`);
+    await settled(page, pixels);
+    await page.keyboard.press('Tab');
+    await frames(page, 3);
+    const [x, y] = GROUND;
+    const held = await tap([x, y]);
+    const begin = await eye();
+    const far = away(begin, held);
+    await finger('touchStart', [x, y]);
+    for (const i of steps) await finger('touchMove', [x - 8 * i, y + 4 * i]);
+    await finger('touchEnd');
+    check(away(begin, await eye()) > 0.01 * far, 'a finger does not move the eye');
+    const [u, v] = [x - 8 * steps.length, y + 4 * steps.length];
+    const still = await tap([u, v]);
+    check(away(still, held) < 0.03 * far, `the finger lost the ground by ${away(still, held)} m of ${far}`);
+
+    const before = away(await eye(), held);
+    await finger('touchStart', [u - 20, v]);
+    await finger('touchStart', [u - 20, v], [u + 20, v]);
+    for (const i of steps) await finger('touchMove', [u - 20 - 5 * i, v], [u + 20 + 5 * i, v]);
+    await finger('touchEnd');
+    const after = away(await eye(), held);
+    // The fingers are two and a half times as far apart; what they did first only tells what they are about.
+    check(after < 0.7 * before, `two fingers go from ${before} m to ${after} m`);
+    await page.screenshot({ path: join(folder, `${graphics}-touch.png`) });
+    await context.close();
+    return `touch ${(before / after).toFixed(2)}`;
+}
+
 /// A page that says what to choose from, if it is not told.
 async function choice(page) {
     await page.goto(`${url}/`);
@@ -257,6 +323,7 @@ for (const graphics of ['webgpu', 'webgl']) {
             await heights(page, reference, blank, graphics),
             await water(page, blank, graphics),
             await imagery(page, blank, graphics),
+            await touch(browser, graphics),
         ].join(', ');
         const what = await look().catch(async (error) => {
             await page.screenshot({ path: join(folder, `${graphics}-failed.png`) }).catch(() => {});

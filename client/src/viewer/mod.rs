@@ -314,9 +314,12 @@ impl Viewer {
         }
         self.begin();
         self.switch_panel(ui);
-        // Frames may take longer than two clicks.
+        // Frames may take longer than two clicks. And a finger or a button that has long been held may still move the ground.
         let delay = CLICK_SECONDS + since.min(1.0);
-        ui.ctx().options_mut(|options| options.input_options.max_double_click_delay = delay);
+        ui.ctx().options_mut(|options| {
+            options.input_options.max_double_click_delay = delay;
+            options.input_options.max_click_duration = f64::INFINITY;
+        });
         self.steer(ui, seconds.min(STEP_SECONDS));
         self.controls.step(seconds.min(STEP_SECONDS));
         let ground = self.ground();
@@ -441,22 +444,19 @@ impl Viewer {
         if response.drag_stopped() {
             self.grabbed = None;
         }
-        // Two fingers: they turn and tilt what is between them; that they spread is a zoom, below.
-        if let Some(touch) = ui.input(egui::InputState::multi_touch) {
-            let middle = pixel(touch.center_pos);
+        let fingers = ui.input(egui::InputState::multi_touch).filter(|fingers| rect.contains(fingers.start_pos));
+        if let Some(fingers) = fingers {
+            // Two of them turn, tilt and spread what is between them.
+            let middle = pixel(fingers.center_pos);
             let point = self.pivot(middle).unwrap_or(self.camera().eye);
-            let tilt = f64::from(touch.translation_delta.y) * TURN_PER_POINT;
+            let tilt = f64::from(fingers.translation_delta.y) * TURN_PER_POINT;
             // The ground turns as the fingers do, so the view the other way.
-            self.controls.turn(point, -f64::from(touch.rotation_delta), -tilt);
+            self.controls.turn(point, -f64::from(fingers.rotation_delta), -tilt);
+            self.zoom(middle, 1.0 / f64::from(fingers.zoom_delta), nearest);
             self.grabbed = None;
-        }
-        if let Some(at) = response.hover_pos() {
+        } else if let Some(at) = response.hover_pos() {
             let (scroll, pinch) = ui.input(|input| (input.smooth_scroll_delta().y, input.zoom_delta()));
-            let factor = (-f64::from(scroll) * ZOOM_PER_POINT).exp() / f64::from(pinch);
-            if factor != 1.0 {
-                let point = self.reach(pixel(at));
-                self.controls.zoom(point, factor, nearest);
-            }
+            self.zoom(pixel(at), (-f64::from(scroll) * ZOOM_PER_POINT).exp() / f64::from(pinch), nearest);
         }
         if response.double_clicked()
             && let Some(hit) = pointer.and_then(|at| self.pick(pixel(at)))
@@ -470,6 +470,14 @@ impl Viewer {
         // A button that has the focus takes no letters.
         if !ui.ctx().text_edit_focused() {
             self.keys(ui, seconds);
+        }
+    }
+
+    /// Brings the eye so many times as far from what is at a place of the picture, in pixels, but no nearer than `nearest`.
+    fn zoom(&mut self, at: DVec2, factor: f64, nearest: f64) {
+        if factor != 1.0 {
+            let point = self.reach(at);
+            self.controls.zoom(point, factor, nearest);
         }
     }
 
