@@ -157,6 +157,14 @@ fn without_room_for_an_answer_one_is_told_when_to_come_back() {
     let refused = until_answered(&served.address, "/scenes", "503").to_lowercase();
     assert!(refused.contains("retry-after: 1") && refused.contains("application/problem+json"), "{refused}");
     assert!(refused.contains("access-control-allow-origin: *"), "{refused}");
+    // Whoever looks after the server is told all the same that it is well.
+    for path in ["/health", "/ready", "/metrics"] {
+        let mut caller = connect(&served.address);
+        request(&mut caller, path);
+        let told = answer(&mut caller);
+        assert!(told.contains("200 OK"), "{path}: {told}");
+    }
+    assert!(until_answered(&served.address, "/scenes", "503").contains("503"), "it was full meanwhile");
     // It is given up in the end, and its place is free.
     until_answered(&served.address, "/scenes", "200 OK");
 }

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 /// Module by module, what it may use of its own crate. `main` is the program; `tests` modules are free.
 const PROTOCOL: &[(&str, &[&str])] = &[
+    ("arguments", &[]),
     ("bintree", &[]),
     ("bitree", &["bintree"]),
     ("diamond", &["bintree"]),
@@ -335,5 +336,21 @@ fn every_shader_is_used() {
     for shader in shaders {
         let name = shader.file_name().unwrap().to_string_lossy().into_owned();
         assert!(rust.contains(&format!("shaders/{name}\")")), "{name} is included nowhere");
+    }
+}
+
+/// Without one of them cargo builds none.
+#[test]
+fn the_image_is_built_from_every_member_of_the_workspace() {
+    let told = read(&workspace().join("Cargo.toml"));
+    let members = told.split_once("members = [").and_then(|(_, rest)| rest.split_once(']')).unwrap().0;
+    let members: Vec<&str> = members.split(',').map(|member| member.trim().trim_matches('"')).collect();
+    assert!(members.contains(&"server"), "{members:?}");
+    let ignored = read(&workspace().join(".dockerignore"));
+    let copied: Vec<&str> = ignored.lines().filter_map(|line| line.strip_prefix('!')).collect();
+    for needed in members.iter().chain(&["Cargo.toml", "Cargo.lock"]) {
+        let within =
+            |copied: &&str| needed.strip_prefix(copied).is_some_and(|r| r.is_empty() || r.starts_with('/'));
+        assert!(copied.iter().any(within), ".dockerignore leaves out {needed}");
     }
 }

@@ -21,6 +21,7 @@ use diamantina_client::sight::Sight;
 use diamantina_client::terrain::{self, Imagery, Terrain, TerrainError};
 use diamantina_client::texture::{Coding, FADE_SECONDS};
 use diamantina_client::viewer::{self, Viewer};
+use diamantina_protocol::arguments::with_negative_numbers;
 use glam::DVec3;
 use keep::{KeepArgs, Kept, tell_offline};
 use look::{LookArgs, untrue};
@@ -80,7 +81,7 @@ struct ViewerArgs {
     #[command(flatten)]
     view: ViewArgs,
     /// Seconds that points take to move where the level of detail changes [default: 0.3, and 0 for tin and with --true]
-    #[arg(long, value_name = "SECONDS", allow_negative_numbers = true)]
+    #[arg(long, value_name = "SECONDS")]
     morph: Option<f64>,
     /// Keep nothing on the disk
     #[arg(long, conflicts_with_all = ["disk_cache", "offline"])]
@@ -99,7 +100,7 @@ struct ViewArgs {
     #[arg(long, default_value = "1380x768", value_name = "WIDTHxHEIGHT", value_parser = parse_size)]
     size: [u32; 2],
     /// The largest error on the screen, in pixels
-    #[arg(long, default_value_t = 1.0, value_name = "PIXELS", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 1.0, value_name = "PIXELS")]
     error_pixels: f64,
     /// Take an error for a sphere of its size, which looks the same from all sides. Without it errors of heights
     /// count for less seen from above, where they hardly show
@@ -107,7 +108,7 @@ struct ViewArgs {
     sphere_error: bool,
     /// How many times as large as in the middle of the picture an error may look at its corners; 1: the same
     /// everywhere
-    #[arg(long, default_value_t = 1.0, value_name = "TIMES", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 1.0, value_name = "TIMES")]
     foveation: f64,
     /// How diamonds are encoded: points take the fewest bytes, tin draws the fewest triangles
     #[arg(long, default_value = "points", value_enum)]
@@ -166,10 +167,10 @@ struct RenderArgs {
     #[arg(short, long, value_name = "PNG")]
     output: PathBuf,
     /// The eye, in the frame's metres [default: where the whole scene is seen]
-    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, requires = "target", allow_hyphen_values = true)]
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, requires = "target")]
     eye: Option<DVec3>,
     /// A point in the middle of the picture, in the frame's metres
-    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, requires = "eye", allow_hyphen_values = true)]
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, requires = "eye")]
     target: Option<DVec3>,
     /// Ask for the whole view in one request, the largest errors first: one round trip after the scene's
     /// description. Without --eye it is asked for as seen from a little farther away than it is then drawn, and
@@ -177,7 +178,7 @@ struct RenderArgs {
     #[arg(long, conflicts_with = "zone")]
     stream: bool,
     /// Seconds to wait for data before drawing what is there
-    #[arg(long, default_value_t = 60.0, value_name = "SECONDS", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 60.0, value_name = "SECONDS")]
     timeout: f64,
     /// Write numbers about the picture here (- for standard output)
     #[arg(long, value_name = "JSON")]
@@ -195,26 +196,20 @@ struct FlyArgs {
     #[arg(long, value_name = "SEED", conflicts_with = "path")]
     random: Option<u64>,
     /// How long a flight at random is, in the path's time
-    #[arg(
-        long,
-        default_value_t = 60.0,
-        value_name = "SECONDS",
-        requires = "random",
-        allow_negative_numbers = true
-    )]
+    #[arg(long, default_value_t = 60.0, value_name = "SECONDS", requires = "random")]
     seconds: f64,
     /// Frames to draw, spread evenly over the path
     #[arg(long, default_value_t = 300, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     frames: u32,
     /// Frames a second at most; 0: as fast as they can be drawn
-    #[arg(long, default_value_t = 30.0, value_name = "N", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 30.0, value_name = "N")]
     fps: f64,
     /// Let each frame wait for its data, up to so many seconds: what a flight takes then follows from its path
     /// alone, and flights can be compared
-    #[arg(long, value_name = "SECONDS", allow_negative_numbers = true)]
+    #[arg(long, value_name = "SECONDS")]
     settle: Option<f64>,
     /// Seconds of the path that the surface takes to move whenever its level of detail changes, up to 60; 0: it jumps
-    #[arg(long, default_value_t = 0.0, value_name = "SECONDS", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 0.0, value_name = "SECONDS")]
     morph: f64,
     #[command(flatten)]
     play: PlayArgs,
@@ -275,7 +270,7 @@ pub(crate) fn run() -> ExitCode {
         std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty());
     let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours);
     log.with_writer(std::io::stderr).init();
-    let result = match Cli::parse().command {
+    let result = match Cli::parse_from(with_negative_numbers(std::env::args_os())).command {
         Command::Render(args) => render(&args),
         Command::Fly(args) => fly(&args),
         Command::View(args) => view(&args),

@@ -18,12 +18,14 @@
 //! | [`texture`] | imagery: a pyramid of tiles, and which of them there are |
 //! | [`zone`] | regions where the viewer stays, and how much of each diamond is seen from there |
 //! | [`wire`] | the one place that knows the serialisation crate |
+//! | [`arguments`] | command lines, as both programs read them |
 //!
 //! **Units and axes, which both ends obey.** Lattice coordinates are integers: x counts samples to the
 //! east, y to the north, both from the south-west corner of the forest. Heights are integers too,
 //! multiples of the layer's quantum, at most [`HEIGHT_MAX`] in magnitude, so that every deduced height
 //! is the same on every platform. Metres appear only in [`message`] and beyond.
 
+pub mod arguments;
 pub mod bintree;
 pub mod bitree;
 pub mod diamond;

@@ -17,16 +17,6 @@ pub(super) struct Cli {
     pub(super) command: Command,
 }
 
-/// Takes a negative number after every option for a value: what is wrong with it is then told in the option's own words,
-/// and not that `-5` is no option.
-pub(super) fn with_negative_numbers(command: clap::Command) -> clap::Command {
-    let with = |arg: clap::Arg| {
-        let is_option = arg.get_action().takes_values() && !arg.is_positional();
-        if is_option { arg.allow_negative_numbers(true) } else { arg }
-    };
-    command.mut_args(with).mut_subcommands(with_negative_numbers)
-}
-
 #[derive(Subcommand)]
 pub(super) enum Command {
     /// Turn DEM files into a store of diamonds
@@ -318,29 +308,20 @@ pub(super) struct HealthArgs {
 #[allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 mod tests {
     use super::*;
-    use clap::{CommandFactory, FromArgMatches};
-
-    /// The options of a command and of those below it that would take `-5` for an option.
-    fn deaf(command: &clap::Command) -> Vec<String> {
-        let own = command.get_opts().filter(|arg| {
-            arg.get_action().takes_values()
-                && !arg.is_allow_negative_numbers_set()
-                && !arg.is_allow_hyphen_values_set()
-        });
-        let own = own.map(|arg| format!("{} {arg}", command.get_name()));
-        own.chain(command.get_subcommands().flat_map(deaf)).collect()
-    }
+    use diamantina_protocol::arguments::with_negative_numbers;
 
     #[test]
-    fn every_option_takes_a_negative_number() {
-        let command = with_negative_numbers(Cli::command());
-        assert_eq!(deaf(&command), Vec::<String>::new());
-        let words = ["", "experiment", "curvature", "dem.tif", "-o", "out", "--eye", "-5"];
-        let Command::Experiment(args) =
-            Cli::from_arg_matches(&command.get_matches_from(words)).unwrap().command
-        else {
+    fn negative_values_are_none_of_the_options() {
+        let nodata = "-3.4028234663852886e+38";
+        let words = ["", "build", "dem.tif", "--nodata", nodata, "-o", "out", "--height-offset", "-.5"];
+        let words = with_negative_numbers(words.map(Into::into));
+        let Command::Build(args) = Cli::try_parse_from(words).unwrap().command else {
             panic!("another command");
         };
         assert_eq!(args.output, PathBuf::from("out"));
+        assert_eq!(
+            (args.ingest.nodata, args.ingest.height_offset),
+            (Some(nodata.parse().unwrap()), Some(-0.5))
+        );
     }
 }

@@ -225,6 +225,7 @@ impl Server {
             let listener = tokio::net::TcpListener::from_std(self.listener)?;
             let metrics = Arc::new(Metrics::new(self.shared));
             // What is encrypted is written by this process in any case.
+            sendfile::outlive_limits()?;
             let files = if self.tls.is_none() { Files::new() } else { None };
             let blobs = Arc::new(Blobs::new(self.limits.cache, files, Arc::clone(&metrics)));
             let (scenes, access, viewer) = (self.scenes, self.access, self.viewer);

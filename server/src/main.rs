@@ -7,9 +7,10 @@ mod series_args;
 
 use arguments::{
     BuildArgs, Cli, Command, ConfigCommand, DemoArgs, Encoding, ExperimentArgs, InspectArgs, MetricName,
-    PublishArgs, RepairArgs, RuleName, ZoneArgs, with_negative_numbers,
+    PublishArgs, RepairArgs, RuleName, ZoneArgs,
 };
 use clap::{ArgMatches, CommandFactory, FromArgMatches};
+use diamantina_protocol::arguments::with_negative_numbers;
 use diamantina_protocol::message::is_name;
 use diamantina_protocol::points::Rule;
 use diamantina_protocol::series::STEP_SECONDS;
@@ -67,7 +68,7 @@ fn start_log(format: LogFormat) {
 }
 
 fn main() -> ExitCode {
-    let matches = with_negative_numbers(Cli::command()).get_matches();
+    let matches = Cli::command().get_matches_from(with_negative_numbers(std::env::args_os()));
     let cli = Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit());
     if !matches!(cli.command, Command::Serve(_)) {
         start_log(LogFormat::Text);

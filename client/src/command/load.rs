@@ -20,13 +20,13 @@ pub(super) struct LoadArgs {
     #[arg(long, default_value_t = 100, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     users: u32,
     /// How long
-    #[arg(long, default_value_t = 60.0, value_name = "SECONDS", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 60.0, value_name = "SECONDS")]
     seconds: f64,
     /// The time in which all users arrive, one after another
-    #[arg(long, default_value_t = 10.0, value_name = "SECONDS", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 10.0, value_name = "SECONDS")]
     arrival: f64,
     /// The mean pause of a user between two views
-    #[arg(long, default_value_t = 5.0, value_name = "SECONDS", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 5.0, value_name = "SECONDS")]
     think: f64,
     /// Paths that users take turns in following, as for `fly` [default: each wanders over the scene by itself]
     #[arg(long, value_name = "JSON")]
@@ -38,7 +38,7 @@ pub(super) struct LoadArgs {
     #[arg(long, default_value = "1380x768", value_name = "WIDTHxHEIGHT", value_parser = parse_size)]
     size: [u32; 2],
     /// The largest error on the screen, in pixels
-    #[arg(long, default_value_t = 2.0, value_name = "PIXELS", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 2.0, value_name = "PIXELS")]
     error_pixels: f64,
     /// What each user's cache may hold, as a viewer counts it; what several hold is there once
     #[arg(long, default_value = "256", value_name = "MIB")]

@@ -30,14 +30,14 @@ pub(super) struct LookArgs {
     colours: Option<ColourName>,
     /// What the ends of the colours stand for: metres, or degrees with --colours slope [default: the lowest and the
     /// highest height of each layer; 0 to 60 degrees]
-    #[arg(long, value_name = "LOW,HIGH", value_parser = parse_pair, allow_hyphen_values = true)]
+    #[arg(long, value_name = "LOW,HIGH", value_parser = parse_pair)]
     range: Option<[f64; 2]>,
     /// How terrain is lit [default: soft; hillshade with --true or --colours hillshade]
     #[arg(long, value_enum)]
     shading: Option<ShadingName>,
     /// What heights are multiplied by, to make gentle relief visible; errors and the heights of eye and
     /// target are multiplied, too
-    #[arg(long, default_value_t = 1.0, value_name = "N", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 1.0, value_name = "N")]
     pub(super) exaggeration: f64,
     /// Tint diamonds by their level
     #[arg(long)]
@@ -52,20 +52,20 @@ pub(super) struct LookArgs {
     #[arg(long, value_enum)]
     water: Option<WaterName>,
     /// How high the waves are: 0 is a mirror, 1 a breeze [default: 1]
-    #[arg(long, value_name = "N", allow_negative_numbers = true)]
+    #[arg(long, value_name = "N")]
     waves: Option<f64>,
     /// The depth of water through which a third of green light comes [default: it fits the layer's extent, at most 12]
-    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
+    #[arg(long, value_name = "METRES")]
     clarity: Option<f64>,
     /// How much of the light on the ground imagery is shown in: 0 as it was taken, 1 as if it were the ground's own colour
     /// [default: 0.5]
-    #[arg(long, value_name = "PART", allow_negative_numbers = true)]
+    #[arg(long, value_name = "PART")]
     texture_light: Option<f32>,
     /// The size of the mirrored picture as a part of the picture's: less is faster, and blurred [default: 1]
-    #[arg(long, value_name = "PART", allow_negative_numbers = true)]
+    #[arg(long, value_name = "PART")]
     mirror_scale: Option<f64>,
     /// How many times as large as --error-pixels errors may be in what water mirrors: more is faster [default: 2]
-    #[arg(long, value_name = "TIMES", allow_negative_numbers = true)]
+    #[arg(long, value_name = "TIMES")]
     mirror_error: Option<f64>,
 }
 
@@ -255,6 +255,7 @@ fn parse_background(text: &str) -> Result<Background, String> {
 mod tests {
     use super::*;
     use clap::Parser;
+    use diamantina_protocol::arguments::with_negative_numbers;
     use diamantina_protocol::message::Frame;
 
     #[derive(Parser)]
@@ -264,7 +265,8 @@ mod tests {
     }
 
     fn parsed(words: &str) -> LookArgs {
-        Only::try_parse_from(["look"].into_iter().chain(words.split_whitespace())).unwrap().look
+        let words = ["look"].into_iter().chain(words.split_whitespace()).map(Into::into);
+        Only::try_parse_from(with_negative_numbers(words)).unwrap().look
     }
 
     fn look(words: &str) -> Look {

@@ -9,14 +9,14 @@ use diamantina_client::terrain::Terrain;
 #[derive(Args, Clone)]
 pub(super) struct TimeArgs {
     /// The time to show of water that changes with time, in seconds from its first step [default: 0]
-    #[arg(long, value_name = "SECONDS", allow_negative_numbers = true)]
+    #[arg(long, value_name = "SECONDS")]
     time: Option<f64>,
 }
 
 #[derive(Args, Clone)]
 pub(super) struct PlayArgs {
     /// Let water change with time on the way: seconds of it for a second of the path, below 0 for backwards
-    #[arg(long, default_value_t = 0.0, value_name = "SPEED", allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 0.0, value_name = "SPEED")]
     play: f64,
     /// Begin again after the last step; else it stays
     #[arg(long = "loop", requires = "play")]

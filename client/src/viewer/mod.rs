@@ -444,7 +444,8 @@ impl Viewer {
         if response.drag_stopped() {
             self.grabbed = None;
         }
-        let fingers = ui.input(egui::InputState::multi_touch).filter(|fingers| rect.contains(fingers.start_pos));
+        let fingers =
+            ui.input(egui::InputState::multi_touch).filter(|fingers| rect.contains(fingers.start_pos));
         if let Some(fingers) = fingers {
             // Two of them turn, tilt and spread what is between them.
             let middle = pixel(fingers.center_pos);

@@ -225,7 +225,8 @@ fn eye(run: &Run<'_>, window: &Window) -> Result<Eye, ExperimentError> {
     Ok(Eye { at, height: ground + run.options.eye, towards: [0.5 * side, 0.55 * side], rise: 0.0 })
 }
 
-fn full_polygons(field: &Field) -> f64 {
+/// The polygons of a mesh of all samples.
+pub(super) fn full_polygons(field: &Field) -> f64 {
     2.0 * f64::from(field.side()).powi(2)
 }
 

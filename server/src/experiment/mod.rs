@@ -56,7 +56,7 @@ pub struct Options {
     #[command(flatten)]
     pub(crate) zone: by_zone::Options,
     /// `curvature`: where the observer stands, in samples from the window's south-west corner [default: the highest of its southern eighth]
-    #[arg(long, value_name = "X,Y", allow_hyphen_values = true, value_parser = windows::parse_place)]
+    #[arg(long, value_name = "X,Y", value_parser = windows::parse_place)]
     pub(crate) observer: Option<Point>,
     /// `curvature`, `zone`: metres of the observer's eye above the ground
     #[arg(long, default_value_t = 50.0, value_name = "METRES")]

@@ -40,7 +40,7 @@ pub struct Options {
     #[arg(long, value_enum, default_value_t = Rule::One)]
     pub(crate) windows: Rule,
     /// South-west sample of the one window [default: in the middle of the DEM]
-    #[arg(long, value_name = "X,Y", allow_hyphen_values = true, value_parser = parse_place)]
+    #[arg(long, value_name = "X,Y", value_parser = parse_place)]
     pub(crate) at: Option<Point>,
 }
 

@@ -106,6 +106,8 @@ fn changed(path: &Path) -> Option<SystemTime> {
 struct Known {
     scenes: HashMap<String, Vec<Hash>>,
     read_at: Option<SystemTime>,
+    /// When the file was last changed, as of the last look at it.
+    seen_at: Option<SystemTime>,
 }
 
 /// The private scenes and their tokens.
@@ -123,17 +125,24 @@ impl Access {
     /// Reads a file of tokens; without one, all scenes are everybody's.
     pub(super) fn open(path: Option<&Path>) -> Result<Self, TokensError> {
         let Some(path) = path else { return Ok(Self::default()) };
-        let known = Known { read_at: changed(path), scenes: parse(path)? };
+        let read_at = changed(path);
+        let known = Known { read_at, seen_at: read_at, scenes: parse(path)? };
         Ok(Self { path: Some(path.to_owned()), known: RwLock::new(known) })
     }
 
-    /// Reads the file again if it has changed. A bad one changes nothing.
+    /// Reads the file again if it has changed, once it has stayed the same from one look to the next: one that is being
+    /// written may be empty for a moment, and would make every scene everybody's. A bad one changes nothing.
     pub(super) fn refresh(&self) {
         let Some(path) = &self.path else { return };
         let now = changed(path);
         if self.look(|known| known.read_at == now) {
             return;
         }
+        let mut known = self.known.write().unwrap_or_else(PoisonError::into_inner);
+        if std::mem::replace(&mut known.seen_at, now) != now {
+            return;
+        }
+        drop(known);
         let read = parse(path);
         let mut known = self.known.write().unwrap_or_else(PoisonError::into_inner);
         known.read_at = now;
@@ -326,8 +335,12 @@ mod tests {
         let caller = access.caller(&headers(&format!("Bearer {token}")));
         let write = |text: &str, minutes: u64| {
             std::fs::write(file.path(), text).unwrap();
+            let before = access.look(|known| known.scenes.len());
             let later = SystemTime::now() + Duration::from_secs(60 * minutes);
             std::fs::File::options().write(true).open(file.path()).unwrap().set_modified(later).unwrap();
+            access.refresh();
+            // Whoever writes it may not have done.
+            assert_eq!(access.look(|known| known.scenes.len()), before);
             access.refresh();
         };
         assert!(access.allows(Caller(None), "alps"));

@@ -92,7 +92,7 @@ impl Front {
     pub(super) async fn answer(&self, connection: &Connection, request: Request<Incoming>) -> Response<Body> {
         let mut ended = Ended {
             metrics: Arc::clone(&self.site.metrics),
-            _answering: connection.activity.begin(),
+            answering: connection.activity.begin(),
             place: None,
             began: Instant::now(),
             from: connection.from,
@@ -108,7 +108,7 @@ impl Front {
         let mut response = match self.admit(connection, &request) {
             Err(refused) => *refused,
             Ok(place) => {
-                ended.place = Some(place);
+                ended.place = place;
                 // The body is empty.
                 let Ok(response) = self.routes.call(request.map(|_| Body::empty())).await;
                 response
@@ -133,12 +133,13 @@ impl Front {
         response.map(|body| Body::new(Held { body, due, ended }))
     }
 
-    /// A place for the answer to a request, if it is one that this server answers and there is room.
+    /// A place for the answer to a request, if it is one that this server answers and there is room. Who asks how the server is
+    /// has to be told, above all when there is much to do: that takes no place, and counts for no rate.
     fn admit(
         &self,
         connection: &Connection,
         request: &Request<Incoming>,
-    ) -> Result<OwnedSemaphorePermit, Box<Response<Body>>> {
+    ) -> Result<Option<OwnedSemaphorePermit>, Box<Response<Body>>> {
         let uri = request.uri();
         if self.stopping.load(Ordering::Relaxed) && uri.path() == "/ready" {
             let detail = "this server is about to stop";
@@ -159,9 +160,10 @@ impl Front {
             // What follows is not read.
             return Err(Box::new(([(header::CONNECTION, "close")], refusal).into_response()));
         }
-        // Who asks how the server is has to be told, above all when there is much to do.
-        let is_about_us = matches!(uri.path(), "/health" | "/ready" | "/metrics");
-        if let Some(rates) = self.rates.as_ref().filter(|_| !is_about_us) {
+        if matches!(uri.path(), "/health" | "/ready" | "/metrics") {
+            return Ok(None);
+        }
+        if let Some(rates) = &self.rates {
             let caller = self.site.access.caller(request.headers());
             if let Err(wait) = rates.take(connection.from.ip(), &self.site.access, caller) {
                 self.site.metrics.rejected("rate");
@@ -169,7 +171,7 @@ impl Front {
                 return Err(Box::new(later(StatusCode::TOO_MANY_REQUESTS, detail, 1 + wait.as_secs())));
             }
         }
-        Arc::clone(&self.places).try_acquire_owned().map_err(|_| {
+        Arc::clone(&self.places).try_acquire_owned().map(Some).map_err(|_| {
             self.site.metrics.rejected("in_flight");
             let detail = "too much to do: ask again in a moment";
             Box::new(later(StatusCode::SERVICE_UNAVAILABLE, detail, RETRY_AFTER))
@@ -210,7 +212,7 @@ fn common_headers(headers: &mut HeaderMap, id: &str, seconds: f64) {
 /// What happens when an answer has ended, whether its last byte was sent or not.
 struct Ended {
     metrics: Arc<Metrics>,
-    _answering: Answering,
+    answering: Answering,
     place: Option<OwnedSemaphorePermit>,
     began: Instant,
     from: SocketAddr,
@@ -267,6 +269,7 @@ impl http_body::Body for Held {
         match &polled {
             Poll::Ready(Some(Ok(frame))) => {
                 self.ended.sent += frame.data_ref().map_or(0, |data| data.len() as u64);
+                self.ended.answering.goes_on();
                 self.ended.is_whole = self.body.is_end_stream();
             }
             Poll::Ready(Some(Err(error))) => {

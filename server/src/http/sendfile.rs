@@ -38,6 +38,12 @@ pub(super) struct Files {
     end: AtomicU64,
 }
 
+/// Where no file may be larger than so much (`ulimit -f`), writing beyond is to fail, and not to end this process. That needs a
+/// handler, and so an async runtime.
+pub(super) fn outlive_limits() -> io::Result<()> {
+    system::outlive_limits()
+}
+
 impl Files {
     /// A new one, if the system has such.
     pub(super) fn new() -> Option<Arc<Self>> {
@@ -253,6 +259,11 @@ mod system {
     use std::os::fd::AsFd;
     use std::os::unix::fs::FileExt as _;
 
+    pub(super) fn outlive_limits() -> io::Result<()> {
+        let number = rustix::process::Signal::XFSZ.as_raw();
+        tokio::signal::unix::signal(tokio::signal::unix::SignalKind::from_raw(number)).map(drop)
+    }
+
     pub(super) fn create() -> io::Result<File> {
         Ok(rustix::fs::memfd_create("diamantina blobs", MemfdFlags::CLOEXEC)?.into())
     }
@@ -286,6 +297,10 @@ mod system {
 
     fn unsupported<T>() -> io::Result<T> {
         Err(io::ErrorKind::Unsupported.into())
+    }
+
+    pub(super) fn outlive_limits() -> io::Result<()> {
+        Ok(())
     }
 
     pub(super) fn create() -> io::Result<File> {

@@ -4,7 +4,7 @@
 //! and nothing written for a while means that nobody is there, that nobody reads, or that somebody holds a place for
 //! nothing. Bytes that come while no answer is under way are the head of a request, which has to end soon, however
 //! often another byte of it comes. Over HTTP/2, where bytes may come at any time, what counts is how long nothing
-//! was asked.
+//! was asked, or nobody took anything of the answers under way: pings go on whether anybody reads or not.
 
 use super::limits::Limits;
 use pin_project_lite::pin_project;
@@ -19,6 +19,9 @@ use tokio::time::{Instant, Sleep, sleep_until};
 /// What an HTTP/2 connection begins with.
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 
+/// Bytes that are written at once for an answer, and not to ping or to be polite.
+const ANSWER_BYTES: usize = 1024;
+
 /// What goes on on a connection.
 #[derive(Debug)]
 pub(super) struct Activity(Mutex<State>);
@@ -29,6 +32,8 @@ struct State {
     moved: Instant,
     /// When the last answer ended, or the connection began.
     rested: Instant,
+    /// When something of an answer was last taken, as far as that can be told.
+    taken: Instant,
     /// Since when the head of a request is being read, over HTTP/1.
     head: Option<Instant>,
     /// When the answers under way began.
@@ -40,7 +45,8 @@ struct State {
 impl Activity {
     pub(super) fn new() -> Arc<Self> {
         let now = Instant::now();
-        let state = State { moved: now, rested: now, head: None, answers: Vec::new(), preface: Some(0) };
+        let state =
+            State { moved: now, rested: now, taken: now, head: None, answers: Vec::new(), preface: Some(0) };
         Arc::new(Self(Mutex::new(state)))
     }
 
@@ -73,8 +79,12 @@ impl Activity {
         }
     }
 
-    fn wrote(&self) {
-        self.lock().moved = Instant::now();
+    fn wrote(&self, bytes: usize) {
+        let mut state = self.lock();
+        state.moved = Instant::now();
+        if bytes >= ANSWER_BYTES {
+            state.taken = state.moved;
+        }
     }
 
     /// When the connection is to be given up, if nothing happens before.
@@ -82,7 +92,12 @@ impl Activity {
         let state = self.lock();
         let still = state.moved + patience.still;
         match state.answers.iter().min() {
-            Some(oldest) => still.min(*oldest + patience.answer),
+            Some(oldest) => {
+                let due = still.min(*oldest + patience.answer);
+                // What is asked meanwhile says nothing of whether answers are read.
+                let taken = state.taken.max(*oldest) + patience.still;
+                if state.is_http_2() { due.min(taken) } else { due }
+            }
             None if state.is_http_2() => still.min(state.rested + patience.still),
             None => state.head.map_or_else(
                 // The last bytes of an answer may still be on their way.
@@ -106,10 +121,18 @@ pub(super) struct Answering {
     began: Instant,
 }
 
+impl Answering {
+    /// Another part of it was taken, to be written.
+    pub(super) fn goes_on(&self) {
+        self.activity.lock().taken = Instant::now();
+    }
+}
+
 impl Drop for Answering {
     fn drop(&mut self) {
         let mut state = self.activity.lock();
         state.rested = Instant::now();
+        state.taken = state.rested;
         if let Some(position) = state.answers.iter().position(|began| *began == self.began) {
             state.answers.swap_remove(position);
         }
@@ -178,13 +201,13 @@ impl<T> Watched<T> {
         happened
     }
 
-    fn written<R>(
+    fn written(
         self: Pin<&mut Self>,
         context: &mut Context<'_>,
-        happened: Poll<io::Result<R>>,
-    ) -> Poll<io::Result<R>> {
-        if happened.is_ready() {
-            self.activity.wrote();
+        happened: Poll<io::Result<usize>>,
+    ) -> Poll<io::Result<usize>> {
+        if let Poll::Ready(written) = &happened {
+            self.activity.wrote(*written.as_ref().unwrap_or(&0));
         }
         self.watch(context, happened)
     }
@@ -258,9 +281,9 @@ impl<T> Noted<T> {
         Self { inner, activity }
     }
 
-    fn written<R>(&self, happened: Poll<io::Result<R>>) -> Poll<io::Result<R>> {
-        if happened.is_ready() {
-            self.activity.wrote();
+    fn written(&self, happened: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
+        if let Poll::Ready(written) = &happened {
+            self.activity.wrote(*written.as_ref().unwrap_or(&0));
         }
         happened
     }
@@ -379,6 +402,36 @@ mod tests {
             let (near, far, _) = pair();
             let (found, ()) = tokio::join!(given_up(near), dribble(far, b"GET"));
             assert_after(found, 300);
+        });
+    }
+
+    #[test]
+    fn pings_do_not_keep_answers_that_nobody_reads() {
+        run(async {
+            let (near, mut far, activity) = pair();
+            let (mut near, mut bytes) = (std::pin::pin!(near), [0; 64]);
+            far.write_all(PREFACE).await.unwrap();
+            assert_eq!(near.read(&mut bytes).await.unwrap(), PREFACE.len());
+            let first = activity.begin();
+            for _ in 0..3 {
+                // Pings go out, and now and then something of the answer.
+                for _ in 0..2 {
+                    sleep(milliseconds(400)).await;
+                    near.write_all(b"ping").await.unwrap();
+                    far.read_exact(&mut bytes[..4]).await.unwrap();
+                }
+                first.goes_on();
+            }
+            // Nor does what is asked meanwhile.
+            let others = [activity.begin(), activity.begin()];
+            for _ in 0..2 {
+                sleep(milliseconds(400)).await;
+                near.write_all(b"ping").await.unwrap();
+            }
+            sleep(milliseconds(300)).await;
+            assert_eq!(near.write_all(b"ping").await.map_err(|e| e.kind()), Ok(()), "who can write writes");
+            assert_eq!(near.read(&mut bytes).await.unwrap_err().kind(), io::ErrorKind::TimedOut);
+            drop((first, others));
         });
     }
 

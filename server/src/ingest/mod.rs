@@ -80,13 +80,13 @@ pub struct Options {
     #[arg(long, value_name = "METRES")]
     pub cell: Option<f64>,
     /// Metres of height in one unit of value [default: from the file, else 1]
-    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
+    #[arg(long, value_name = "METRES")]
     pub height_scale: Option<f64>,
     /// Metres of height at value 0 [default: from the file, else 0]
-    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
+    #[arg(long, value_name = "METRES")]
     pub height_offset: Option<f64>,
     /// The value that means "no data", instead of the file's; nan: all values are heights
-    #[arg(long, value_name = "VALUE", allow_negative_numbers = true)]
+    #[arg(long, value_name = "VALUE")]
     pub nodata: Option<f64>,
     /// Read the files as bare little-endian samples, rows from the north; types u8 i16 u16 i32 u32 f32 f64
     #[arg(long, value_name = "WIDTHxHEIGHT:TYPE")]

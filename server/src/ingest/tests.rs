@@ -1,5 +1,6 @@
 //! Claims about ingest: small files made in code, then every real DEM at hand.
 
+use diamantina_protocol::arguments::with_negative_numbers;
 use std::collections::HashMap;
 use std::fs;
 use std::io::{Cursor, Write};
@@ -39,8 +40,10 @@ struct CommandLine {
 
 #[test]
 fn the_command_line_says_it_all() {
-    let parse =
-        |line: &str| <CommandLine as clap::Parser>::try_parse_from(line.split(' ')).map(|c| c.options);
+    let parse = |line: &str| {
+        let words = with_negative_numbers(line.split(' ').map(Into::into));
+        <CommandLine as clap::Parser>::try_parse_from(words).map(|c| c.options)
+    };
     let options =
         parse("x --crs epsg:32632 --cell 30 --nodata -9999 --height-offset -5 --raw 7x9:i16").unwrap();
     assert_eq!((options.crs, options.nodata), (CrsChoice::Epsg(32632), Some(-9999.0)));

@@ -18,6 +18,7 @@ use object_store::path::Path as Name;
 use object_store::{
     BackoffConfig, ClientOptions, Error, GetOptions, GetResult, ObjectStore, RetryConfig, UpdateVersion,
 };
+use std::borrow::Cow;
 use std::ops::Range;
 use std::path::Path;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
@@ -111,13 +112,22 @@ impl From<Error> for Failure {
     }
 }
 
-/// What was said, on one line and not too long of it.
+/// What was said, on one line and not too long of it; never what stands before an @ in an address.
 fn short(words: &str) -> String {
-    let line = words.split_whitespace().collect::<Vec<_>>().join(" ");
+    let line = words.split_whitespace().map(masked).collect::<Vec<_>>().join(" ");
     match line.char_indices().nth(WORDS_SHOWN) {
         Some((end, _)) => format!("{}...", &line[..end]),
         None => line,
     }
+}
+
+/// A word without the credentials of an address in it.
+fn masked(word: &str) -> Cow<'_, str> {
+    let parts = word.split_once("://").and_then(|(scheme, rest)| {
+        let end = rest.find(['/', '?', '#']).unwrap_or(rest.len());
+        Some((scheme, &rest[rest[..end].rfind('@')? + 1..]))
+    });
+    parts.map_or(Cow::Borrowed(word), |(scheme, rest)| Cow::Owned(format!("{scheme}://{rest}")))
 }
 
 impl Failure {
@@ -444,6 +454,12 @@ mod tests {
         assert!(is_address(Path::new("s3://a/b")));
         assert_eq!(folder(Path::new("file:///a/b")), Path::new("/a/b"));
         assert_eq!(folder(Path::new("a/b")), Path::new("a/b"));
+    }
+
+    #[test]
+    fn what_a_library_says_tells_no_credentials() {
+        let said = "sending to http://u:p@sekret@127.0.0.1:9/b?x=a@b failed: (https://host/a@b) me@here";
+        assert_eq!(short(said), "sending to http://127.0.0.1:9/b?x=a@b failed: (https://host/a@b) me@here");
     }
 
     #[tokio::test(start_paused = true)]

@@ -10,7 +10,7 @@ mod map;
 mod region;
 mod sight;
 
-use super::by_curvature::with_share;
+use super::by_curvature::{full_polygons, with_share};
 use super::curvature::quadtree::{Quadtree, Sums};
 use super::curvature::templates;
 use super::report::{Picture, Report, Table};
@@ -222,7 +222,14 @@ fn one(
         let (threshold, mesh) = with_share(field, &plain, None, share / 100.0);
         let meshes = [mesh, templates::triangles(&Quadtree::new(field, &masked, threshold, None))];
         let surfaces = meshes.each_ref().map(|mesh| view::surface(field, mesh));
-        let tolerance = format!("T = {threshold:.3e} ({share} % of the polygons)");
+        let left = 100.0 * meshes[0].len() as f64 / full_polygons(field);
+        // Where much is without a height, even the coarsest mesh has more.
+        let told = if left > share {
+            format!(", of which no fewer than {left:.1} % can be had")
+        } else {
+            String::new()
+        };
+        let tolerance = format!("T = {threshold:.3e} ({share} % of the polygons{told})");
         let selected = String::new();
         push(0, Pair { kind: "curvature quadtree", tolerance, selected, meshes, surfaces })?;
     }
