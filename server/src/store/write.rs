@@ -304,13 +304,16 @@ fn move_into_place(data: &Path, place: &Path) -> Result<(), StoreError> {
 }
 
 /// Removes the folders of versions that are not current: the one before, and what a kill left of others.
-/// A server that has one open keeps its files; who cannot remove one only keeps some bytes more.
+/// A server that has one open keeps its files; who cannot remove one only keeps some bytes more. Each goes under another name
+/// first: of half a version nobody would know later that it was one.
 fn remove_others(root: &Path, current: &str) {
+    let gone = root.join(GONE_FOLDER);
+    let _ = fs::remove_dir_all(&gone);
     for entry in fs::read_dir(root).into_iter().flatten().flatten() {
         let name = entry.file_name();
         if name.to_str().is_some_and(is_version) && name != current && entry.path().join("directory").exists()
         {
-            let _ = fs::remove_dir_all(entry.path());
+            let _ = fs::rename(entry.path(), &gone).and_then(|()| fs::remove_dir_all(&gone));
         }
     }
 }
@@ -373,4 +376,33 @@ pub(super) fn write_synced(path: &Path, bytes: &[u8]) -> Result<(), StoreError> 
 
 pub(super) fn sync_folder(path: &Path) -> Result<(), StoreError> {
     File::open(path).and_then(|f| f.sync_all()).map_err(io_at("sync the folder", path))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::BTreeSet;
+
+    #[test]
+    fn of_other_versions_nothing_is_left_though_a_removal_was_cut_off() {
+        let folder = tempfile::tempdir().unwrap();
+        let version = |digit: u8| char::from(digit).to_string().repeat(16);
+        let put = |name: &str, file: &str| {
+            let path = folder.path().join(name);
+            fs::create_dir_all(&path).unwrap();
+            fs::write(path.join(file), b"x").unwrap();
+        };
+        put(&version(b'a'), "directory");
+        for other in [b'b', b'c'] {
+            put(&version(other), "directory");
+            put(&version(other), "pack-00000");
+        }
+        // A kill left half of one, and somebody's own folder looks like a version.
+        put(GONE_FOLDER, "pack-00000");
+        put(&version(b'd'), "photos");
+        remove_others(folder.path(), &version(b'a'));
+        let left = fs::read_dir(folder.path()).unwrap();
+        let left: BTreeSet<_> = left.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        assert_eq!(left, [version(b'a'), version(b'd')].into());
+    }
 }
