@@ -193,8 +193,8 @@ def main():
                 f.writelines(route + "\n" for _, route in lines)
             script = script_of(LUA, folder, f"{size}.batch", f"{size}.batch")
             mean = sum(int(count) for count, _ in lines) / len(lines)
-            one = "diamantina"
-            rate = medians([measure(ports[one], of[one], script, options) for _ in range(options.rounds)])[0]
+            server = ports["diamantina"], of["diamantina"]
+            rate = medians([measure(*server, script, options) for _ in range(options.rounds)])[0]
             print(f"| {size} | {mean:.0f} | {rate:.0f} | {rate * mean:.0f} | {rate * mean / rates[size]:.1f} |", flush=True)
     finally:
         for server in (nginx, diamantina):

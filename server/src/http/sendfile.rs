@@ -21,6 +21,8 @@ use std::task::{Context, Poll, ready};
 use tokio::io::{AsyncRead, AsyncWrite, Interest, ReadBuf};
 use tokio::net::TcpStream;
 
+pub(super) use system::outlive_limits;
+
 /// Bytes from which on a blob is worth a call of the system of its own.
 const LEAST: usize = 16 << 10;
 
@@ -36,12 +38,6 @@ pub(super) struct Files {
     file: File,
     /// What lies behind is not in use.
     end: AtomicU64,
-}
-
-/// Where no file may be larger than so much (`ulimit -f`), writing beyond is to fail, and not to end this process. That needs a
-/// handler, and so an async runtime.
-pub(super) fn outlive_limits() -> io::Result<()> {
-    system::outlive_limits()
 }
 
 impl Files {
@@ -259,7 +255,9 @@ mod system {
     use std::os::fd::AsFd;
     use std::os::unix::fs::FileExt as _;
 
-    pub(super) fn outlive_limits() -> io::Result<()> {
+    /// Where no file may be larger than so much (`ulimit -f`), writing beyond is to fail, and not to end this process. That
+    /// needs a handler, and so an async runtime.
+    pub(in crate::http) fn outlive_limits() -> io::Result<()> {
         let number = rustix::process::Signal::XFSZ.as_raw();
         tokio::signal::unix::signal(tokio::signal::unix::SignalKind::from_raw(number)).map(drop)
     }
@@ -299,7 +297,7 @@ mod system {
         Err(io::ErrorKind::Unsupported.into())
     }
 
-    pub(super) fn outlive_limits() -> io::Result<()> {
+    pub(in crate::http) fn outlive_limits() -> io::Result<()> {
         Ok(())
     }
 
