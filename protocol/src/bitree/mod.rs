@@ -32,9 +32,6 @@ use std::ops::ControlFlow;
 /// The largest grid: 2^12 + 1 points a side; 134 MB of counts and as much of heights.
 pub const LOG2_MAX: u8 = 12;
 
-/// Means of means that are worked out from real points around; more is found along the way from the top.
-const NEAR: u32 = 3;
-
 /// What a grid point is in a bitree.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Presence {
@@ -168,14 +165,26 @@ impl Bitree {
     /// Counts the real middles at and below a triangle: by the slot of its middle and the steps in slots from there to its
     /// apex c and to the end a of its hypotenuse.
     fn recount(&mut self, path: u32, middle: usize, to_apex: isize, to_end: isize) -> u32 {
-        let mut count = u32::from(!self.real[middle].is_nan());
-        if (2 * path as usize) < self.below.len() {
+        let is_real = |real: &[f64], middle: usize| u32::from(!real[middle].is_nan());
+        let mut count = is_real(&self.real, middle);
+        let [first, last] = [path as usize, self.below.len()];
+        if 2 * first < last {
             let [to_left, to_right] = [(to_apex + to_end) / 2, (to_apex - to_end) / 2];
             let [left, right] = [to_left, to_right].map(|step| middle.wrapping_add_signed(step));
-            count += self.recount(path << 1, left, -to_left, to_right);
-            count += self.recount(path << 1 | 1, right, -to_right, -to_left);
+            let halves = if 4 * first < last {
+                [
+                    self.recount(path << 1, left, -to_left, to_right),
+                    self.recount(path << 1 | 1, right, -to_right, -to_left),
+                ]
+            } else {
+                // Half of all triangles are those without any below: here, without a call for each.
+                let halves = [left, right].map(|middle| is_real(&self.real, middle));
+                self.below[2 * first..2 * first + 2].copy_from_slice(&halves);
+                halves
+            };
+            count += halves[0] + halves[1];
         }
-        self.below[path as usize] = count;
+        self.below[first] = count;
         count
     }
 
@@ -228,23 +237,8 @@ impl Bitree {
 
     /// Takes a point out of the selection; gives back its height. The corners stay.
     pub fn remove(&mut self, point: Point) -> Option<f64> {
-        self.remove_if(point, |_| ControlFlow::Continue(()))
-    }
-
-    /// Takes a point out of the selection if `visit` does not break: it is called with each triangle that is drawn otherwise
-    /// then, as it is then. Gives back the point's height if it is gone. The corners stay.
-    pub fn remove_if(
-        &mut self,
-        point: Point,
-        mut visit: impl FnMut(&Facet) -> ControlFlow<()>,
-    ) -> Option<f64> {
         let height = self.real(point).filter(|_| self.level(point) != Some(0))?;
         let around = self.around(point);
-        for facet in around.iter().flatten() {
-            if self.changes_without_middle(facet, &mut visit).is_break() {
-                return None;
-            }
-        }
         let slot = self.slot(point);
         self.real[slot] = f64::NAN;
         self.count(around, u32::MAX);
@@ -275,27 +269,10 @@ impl Bitree {
         // First the triangle to the east, or else to the north.
         let is_first = (y, a[0]) > (a[1], x);
         let ways = if is_first { [[a, b], [b, a]] } else { [[b, a], [a, b]] };
-        ways.map(|[a, b]| self.inside(apex(a)).then(|| self.at([a, apex(a), b], level)))
-    }
-
-    /// The triangle with these corners, of that level.
-    fn at(&self, corners: [Point; 3], level: u32) -> Facet {
-        let (path, corners) = descend(self.log2, inside(corners), level);
-        let [Some(ha), Some(hc), Some(hb)] = corners.map(|p| self.near(p, NEAR)) else {
-            // One hangs on many others: along the way to it each height is found once.
-            return self.facet(path).unwrap_or(Facet { path, corners, heights: [f64::NAN; 3] });
-        };
-        Facet { path, corners, heights: [ha, hc, hb] }
-    }
-
-    /// The height of the surface at a point, if it follows from real ones in so many steps.
-    fn near(&self, point: Point, steps: u32) -> Option<f64> {
-        let own = self.real[self.slot(point)];
-        if !own.is_nan() {
-            return Some(own);
-        }
-        let [a, b] = hypotenuse(self.log2, point).filter(|_| steps > 0)?;
-        Some((self.near(a, steps - 1)? + self.near(b, steps - 1)?) / 2.0)
+        ways.map(|[a, b]| {
+            let corners = [a, apex(a), b];
+            self.inside(corners[1]).then(|| self.facet(descend(self.log2, inside(corners), level).0))?
+        })
     }
 
     /// The two halves of the grid.
@@ -356,58 +333,6 @@ impl Bitree {
         ControlFlow::Continue(())
     }
 
-    /// The triangles that would be drawn otherwise, of those at or below one, were its middle not real: as they would be
-    /// then. Most of what is below hangs on other points. Calls `visit` with each, until it breaks.
-    fn changes_without_middle(
-        &self,
-        from: &Facet,
-        visit: &mut impl FnMut(&Facet) -> ControlFlow<()>,
-    ) -> ControlFlow<()> {
-        if self.below.get(from.path as usize).is_none_or(|count| *count <= 1) {
-            return visit(from);
-        }
-        let (m, height) = self.middle(from);
-        for is_right in [false, true] {
-            let half = from.half(is_right, m, height);
-            self.changes(&half, half_heights(is_right, from.heights, from.mean()), visit)?;
-        }
-        ControlFlow::Continue(())
-    }
-
-    /// The triangles drawn at or below one that have other heights once its corners have others.
-    fn changes(
-        &self,
-        from: &Facet,
-        to: [f64; 3],
-        visit: &mut impl FnMut(&Facet) -> ControlFlow<()>,
-    ) -> ControlFlow<()> {
-        if from.heights == to {
-            return ControlFlow::Continue(());
-        }
-        let changed = Facet { heights: to, ..*from };
-        if !self.is_split(from) {
-            return visit(&changed);
-        }
-        let (m, height) = self.middle(from);
-        let (_, to_height) = self.middle(&changed);
-        for is_right in [false, true] {
-            let half = from.half(is_right, m, height);
-            self.changes(&half, half_heights(is_right, to, to_height), visit)?;
-        }
-        ControlFlow::Continue(())
-    }
-
-    /// How high the surface is at a point where nothing is real but what is above it: the mean of the ends of its
-    /// hypotenuse. `None` as of [`hypotenuse`].
-    #[must_use]
-    pub fn height_without(&self, point: Point) -> Option<f64> {
-        let [a, b] = hypotenuse(self.log2, point)?.map(|end| self.near(end, NEAR));
-        if let (Some(a), Some(b)) = (a, b) {
-            return Some((a + b) / 2.0);
-        }
-        self.around(point).into_iter().flatten().next().map(|facet| facet.mean())
-    }
-
     /// The height of a real point.
     #[must_use]
     pub fn real(&self, point: Point) -> Option<f64> {
@@ -433,7 +358,7 @@ impl Bitree {
         match self.presence(point) {
             Presence::Absent => None,
             Presence::Real => self.real(point),
-            Presence::Fictitious => self.height_without(point),
+            Presence::Fictitious => self.around(point).into_iter().flatten().next().map(|facet| facet.mean()),
         }
     }
 }
@@ -572,10 +497,9 @@ mod tests {
             let facets: Vec<Facet> = bitree.around(point).into_iter().flatten().collect();
             assert_eq!(hypotenuse(4, point).is_some(), !facets.is_empty(), "{point:?}");
             for facet in facets {
-                let ([a, _, b], [ha, _, hb]) = (facet.corners(), facet.heights());
+                let [a, _, b] = facet.corners();
                 let ends = hypotenuse(4, point).unwrap();
                 assert!(ends == [a, b] || ends == [b, a], "{point:?}: {ends:?}");
-                assert_eq!(bitree.height_without(point), Some((ha + hb) / 2.0), "{point:?}");
             }
         }
         assert_eq!(hypotenuse(4, [17, 3]), None);
@@ -594,31 +518,6 @@ mod tests {
         }
         assert_eq!(Facet::new(3, [[0, 1], [1, 1], [1, 2]], [0.0; 3]), None, "the other diagonal");
         assert_eq!(Facet::new(3, [[u32::MAX; 2]; 3], [0.0; 3]), None, "outside");
-    }
-
-    #[test]
-    fn what_removing_changes_is_told_beforehand() {
-        let mut bitree = flat(3);
-        for (point, height) in [([4, 4], 3.0), ([1, 2], -7.0), ([5, 0], 11.0), ([8, 4], 6.0), ([6, 2], 1.0)] {
-            bitree.add(point, height);
-        }
-        for point in [[4, 4], [1, 2], [5, 0], [8, 4], [6, 2]] {
-            let mut removed = bitree.clone();
-            removed.remove(point);
-            for (before, after) in bitree.around(point).into_iter().zip(removed.around(point)) {
-                let (Some(before), Some(after)) = (before, after) else { continue };
-                let [mut told, mut was, mut is] = [Vec::new(), Vec::new(), Vec::new()];
-                let into = |list: &mut Vec<Facet>, facet: &Facet| {
-                    list.push(*facet);
-                    ControlFlow::Continue(())
-                };
-                let _ = bitree.changes_without_middle(&before, &mut |facet| into(&mut told, facet));
-                let _ = bitree.leaves(&before, &mut |facet| into(&mut was, facet));
-                let _ = removed.leaves(&after, &mut |facet| into(&mut is, facet));
-                is.retain(|facet| !was.contains(facet));
-                assert_eq!(told, is, "{point:?}");
-            }
-        }
     }
 
     #[test]

@@ -23,8 +23,9 @@ impl Plane {
     pub fn new([a, c, b]: [Point; 3], [ha, hc, hb]: [f64; 3]) -> Self {
         let leg = |p: Point, i: usize| f64::from(p[i]) - f64::from(c[i]);
         let square = leg(a, 0) * leg(a, 0) + leg(a, 1) * leg(a, 1);
-        // The legs are as long as each other and at right angles.
-        let slope = [0, 1].map(|i| ((ha - hc) * leg(a, i) + (hb - hc) * leg(b, i)) / square);
+        // The legs are as long as each other and at right angles, and their square is a power of two.
+        let part = 1.0 / square;
+        let slope = [0, 1].map(|i| ((ha - hc) * leg(a, i) + (hb - hc) * leg(b, i)) * part);
         Self { origin: c.map(f64::from), height: hc, slope }
     }
 
@@ -108,26 +109,39 @@ pub fn exceeds(
     heights: [f64; 3],
     tolerance: f64,
 ) -> bool {
-    let is_off = |p: Point, height: f64| {
-        let slot = field.slot(p);
-        weights.map_or(1.0, |w| f64::from(w[slot])) * (field.heights()[slot] - height).abs() > tolerance
-    };
+    let is_off = |i: usize| is_off(field, weights, corners[i], heights[i], tolerance);
+    is_off(0) || is_off(1) || is_off(2) || exceeds_between(field, weights, corners, heights, tolerance)
+}
+
+/// The same where no sample at the corners is off by so much: of the finest triangles nothing is left then.
+#[must_use]
+pub fn exceeds_between(
+    field: &Field,
+    weights: Option<&[f32]>,
+    corners: [Point; 3],
+    heights: [f64; 3],
+    tolerance: f64,
+) -> bool {
     let ([a, c, b], [ha, hc, hb]) = (corners, heights);
-    if is_off(a, ha) || is_off(c, hc) || is_off(b, hb) {
-        return true;
-    }
     // Middles of sides lie on the grid, or the triangle has no more samples. Means are exact, as the plane is.
     for ((p, hp), (q, hq)) in [((a, ha), (b, hb)), ((a, ha), (c, hc)), ((c, hc), (b, hb))] {
         if (p[0] ^ q[0] | p[1] ^ q[1]) & 1 == 1 {
             return false;
         }
-        if is_off([p[0].midpoint(q[0]), p[1].midpoint(q[1])], (hp + hq) / 2.0) {
+        let middle = [p[0].midpoint(q[0]), p[1].midpoint(q[1])];
+        if is_off(field, weights, middle, (hp + hq) / 2.0, tolerance) {
             return true;
         }
     }
     // With these the smallest triangle with three middles is complete.
     let is_small = c[0].abs_diff(a[0]) + c[1].abs_diff(a[1]) == 2 && (c[0] == a[0] || c[1] == a[1]);
     !is_small && vertical_error(field, weights, corners, heights, tolerance) > tolerance
+}
+
+/// Whether a sample, times its weight, is further from a height than a tolerance.
+fn is_off(field: &Field, weights: Option<&[f32]>, point: Point, height: f64, tolerance: f64) -> bool {
+    let slot = field.slot(point);
+    weights.map_or(1.0, |w| f64::from(w[slot])) * (field.heights()[slot] - height).abs() > tolerance
 }
 
 /// The height of a bitree's surface at each sample, data or not.
@@ -149,36 +163,35 @@ pub fn surface(field: &Field, tree: &Bitree) -> Vec<f64> {
     heights
 }
 
+/// The runs of at least so many samples are compared four at a time: shorter ones are over before that pays.
+const LONG: usize = 12;
+
 /// Over one run; comparisons with NaN are false, so samples without data never count.
 fn row_error(heights: &[f64], weights: Option<&[f32]>, start: f64, slope: f64) -> f64 {
+    let larger = |worst: f64, found: f64| if found > worst { found } else { worst };
+    if let Some(weights) = weights {
+        let mut worst = 0.0;
+        for ((h, w), x) in heights.iter().zip(weights).zip(0u32..) {
+            worst = larger(worst, f64::from(*w) * (h - (start + slope * f64::from(x))).abs());
+        }
+        return worst;
+    }
+    let (long, rest) = heights.split_at(if heights.len() < LONG { 0 } else { heights.len() & !3 });
     let mut worst = [0.0f64; 4];
-    let keep = |worst: &mut f64, found: f64| {
-        if found > *worst {
-            *worst = found;
-        }
-    };
-    match weights {
-        None => {
-            let chunks = heights.chunks_exact(4);
-            let rest = chunks.remainder();
-            let mut x = [0.0, 1.0, 2.0, 3.0];
-            for chunk in chunks {
-                for i in 0..4 {
-                    keep(&mut worst[i], (chunk[i] - (start + slope * x[i])).abs());
-                    x[i] += 4.0;
-                }
-            }
-            for (h, x) in rest.iter().zip(x) {
-                keep(&mut worst[0], (h - (start + slope * x)).abs());
-            }
-        }
-        Some(weights) => {
-            for ((h, w), x) in heights.iter().zip(weights).zip(0u32..) {
-                keep(&mut worst[0], f64::from(*w) * (h - (start + slope * f64::from(x))).abs());
-            }
+    let mut x = [0.0, 1.0, 2.0, 3.0];
+    for chunk in long.chunks_exact(4) {
+        for i in 0..4 {
+            worst[i] = larger(worst[i], (chunk[i] - (start + slope * x[i])).abs());
+            x[i] += 4.0;
         }
     }
-    worst[0].max(worst[1]).max(worst[2]).max(worst[3])
+    let mut worst = if long.is_empty() { 0.0 } else { worst[0].max(worst[1]).max(worst[2]).max(worst[3]) };
+    let mut x = x[0];
+    for h in rest {
+        worst = larger(worst, (h - (start + slope * x)).abs());
+        x += 1.0;
+    }
+    worst
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use super::Strategy;
 use crate::experiment::curvature::curvatures;
 use crate::experiment::field::Field;
-use crate::experiment::scan::{Plane, exceeds, rows, vertical_error};
+use crate::experiment::scan::{Plane, exceeds, exceeds_between, rows, vertical_error};
 use clap::ValueEnum;
 use diamantina_protocol::bintree::Point;
 use diamantina_protocol::bitree::{Bitree, Facet};
@@ -123,7 +123,12 @@ impl Criterion {
 
     /// Whether a sample that is off the surface by so much makes its triangle worse than a tolerance by itself.
     pub(super) fn is_beyond(self, ground: &Ground<'_>, slot: usize, off: f64, tolerance: f64) -> bool {
-        self == Self::Vertical && ground.weight(slot) * off.abs() > tolerance
+        self.is_of_samples() && ground.weight(slot) * off.abs() > tolerance
+    }
+
+    /// Whether a triangle is as bad as the worst of its samples by itself, whatever triangle that is in.
+    pub(super) fn is_of_samples(self) -> bool {
+        self == Self::Vertical
     }
 
     /// Whether the error of a triangle with these corners, apex in the middle, is more than the tolerance.
@@ -142,6 +147,20 @@ impl Criterion {
                 .map_or(0.0, |facet| self.error(ground, &facet, tolerance)),
         };
         error > tolerance
+    }
+
+    /// The same where none of the corners is beyond the tolerance by itself, see [`Criterion::is_beyond`].
+    pub(super) fn exceeds_between(
+        self,
+        ground: &Ground<'_>,
+        corners: [Point; 3],
+        heights: [f64; 3],
+        tolerance: f64,
+    ) -> bool {
+        match self.is_of_samples() {
+            true => exceeds_between(ground.field, ground.weights, corners, heights, tolerance),
+            false => self.exceeds(ground, corners, heights, tolerance),
+        }
     }
 
     /// The points whose coefficients are more than the tolerance; by another criterion, the corners alone.

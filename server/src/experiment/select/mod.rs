@@ -16,6 +16,7 @@
 mod criterion;
 mod greedy;
 mod prune;
+mod surface;
 mod top_down;
 
 pub use criterion::{Criterion, Ground};
@@ -26,6 +27,7 @@ pub use top_down::top_down;
 use diamantina_protocol::bitree::Bitree;
 use std::fmt;
 use std::ops::ControlFlow;
+use surface::Surface;
 
 /// How points were found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -60,28 +62,25 @@ pub const GREEDY_SHARE: f64 = 0.3;
 pub fn by_strategy(ground: &Ground<'_>, criterion: Criterion, tolerance: f64, strategy: Strategy) -> Bitree {
     let refine = |tree| greedy(ground, criterion, tolerance, GREEDY_SHARE, usize::MAX, tree);
     let from_top = |share| {
-        let (tree, may_go) = top_down::descend(ground, criterion, tolerance, share);
-        (tree, Some(may_go))
+        let surface = top_down::descend(ground, criterion, tolerance, share);
+        match criterion {
+            // A fictitious corner is near a steep triangle's plane, and too far from a flatter one's that a point
+            // beside it made later; and it tilts the finest triangles. Then the corner itself has to become real, which
+            // no descent does.
+            Criterion::Euclidean | Criterion::Normal => Surface::of(&refine(surface.into_tree())),
+            Criterion::Vertical | Criterion::Curvature | Criterion::Coefficient => surface,
+        }
     };
-    let (mut tree, mut may_go) = match strategy {
+    let surface = match strategy {
         Strategy::Compact => from_top(0.0),
         Strategy::Sparse => from_top(1.0),
-        Strategy::Greedy => (refine(ground.field().tree()), None),
-        Strategy::Direct => (criterion.direct(ground, tolerance), None),
+        Strategy::Greedy => Surface::of(&refine(ground.field().tree())),
+        Strategy::Direct => return criterion.direct(ground, tolerance),
     };
-    if matches!(criterion, Criterion::Euclidean | Criterion::Normal) && strategy != Strategy::Greedy {
-        // A fictitious corner is near a steep triangle's plane, and too far from a flatter one's that a point
-        // beside it made later; and it tilts the finest triangles. Then the corner itself has to become real, which
-        // no descent does.
-        (tree, may_go) = (refine(tree), None);
+    match criterion.is_measured() {
+        true => prune::prune_surface(ground, criterion, tolerance, surface).into_tree(),
+        false => surface.into_tree(),
     }
-    if strategy != Strategy::Direct && criterion.is_measured() {
-        match may_go {
-            Some(points) => prune::prune_among(ground, criterion, tolerance, &mut tree, points),
-            None => prune(ground, criterion, tolerance, &mut tree),
-        }
-    }
-    tree
 }
 
 /// The points that keep a criterion's error of every triangle within `tolerance`, found in the better way for that
