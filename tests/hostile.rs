@@ -470,6 +470,25 @@ fn a_flipped_bit_anywhere_is_found_and_its_file_named() {
 }
 
 #[test]
+fn all_blobs_that_are_damaged_are_named() {
+    let world = World::sample(257, 0.0);
+    let folder = world.folder.path();
+    let version = &world.report.scene.version;
+    let path = folder.join("store").join(version).join("pack-00000");
+    let length = std::fs::metadata(&path).unwrap().len();
+    // The first and the last byte, and one between, are of three blobs.
+    with_flip(&path, 0, 3, || {
+        with_flip(&path, length as usize / 2, 1, || {
+            with_flip(&path, length as usize - 1, 7, || {
+                let ended = server(folder, "inspect --verify {}/store");
+                assert_failed(&ended, 1, &["pack-00000", "2 more of its blobs", "at byte 0 "], "three flips");
+                assert_eq!(ended.err.matches("has checksum").count(), 3, "{}", ended.err);
+            });
+        });
+    });
+}
+
+#[test]
 fn no_bit_of_the_description_can_flip_unseen() {
     let world = World::sample(257, 0.0);
     let store = world.folder.path().join("store");

@@ -20,6 +20,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// Base-2 logarithm of the side of the chunks that are verified at once: some tens of megabytes each.
 const VERIFY_CHUNK_LOG2: u32 = 10;
 
+/// Blobs whose checksums are compared at once.
+const BLOBS_AT_ONCE: usize = 64;
+
 /// Why a store could not be inspected, or what is wrong with it.
 #[derive(Debug, thiserror::Error)]
 pub enum InspectError {
@@ -256,6 +259,13 @@ pub fn inspect(store: &Store, verify: bool) -> Result<Inspection, InspectError> 
         masks(store, position)?;
     }
     Ok(Inspection { scene: store.scene().clone(), layers, verified: verify })
+}
+
+/// What is wrong with blobs by their checksums, or by what the disk says of them: of all there are, as they lie.
+#[must_use]
+pub fn damaged(store: &Store) -> Vec<StoreError> {
+    let wrong = |keys: &[Key]| store.get_many(keys).into_iter().filter_map(Result::err).collect::<Vec<_>>();
+    store.keys_in_order().par_chunks(BLOBS_AT_ONCE).flat_map_iter(wrong).collect()
 }
 
 /// Compares the sizes of a layer's points with its index; the bytes of the pages.

@@ -482,7 +482,10 @@ fn inspect_store(args: &InspectArgs) -> Result<(), Failure> {
     let disk = folder.as_ref().map(|folder| Disk::open(folder.path(), INSPECTED_BYTES)).transpose()?;
     let shared = Arc::new(Shared { disk, ..Shared::default() });
     let store = Arc::new(Store::open_sharing(&args.store, &shared)?);
-    let inspection = inspect::inspect(&store, args.verify)?;
+    let inspection = match inspect::inspect(&store, args.verify) {
+        Err(first) if args.verify => return Err(all_damage(&store, &first.to_string())),
+        inspected => inspected?,
+    };
     let mut out = std::io::stdout().lock();
     if let Some(path) = &args.curve {
         if path.as_os_str() == "-" {
@@ -498,6 +501,23 @@ fn inspect_store(args: &InspectArgs) -> Result<(), Failure> {
         shown(print::inspection(&mut out, &inspection))?;
     }
     Ok(())
+}
+
+/// The first thing that was found wrong with a store, and all other blobs that are damaged.
+fn all_damage(store: &Store, first: &str) -> Failure {
+    let found: Vec<String> = inspect::damaged(store).iter().map(ToString::to_string).collect();
+    let others: Vec<&str> = found.iter().map(String::as_str).filter(|other| *other != first).collect();
+    if others.is_empty() {
+        return Failure(1, first.to_owned());
+    }
+    let mut words = format!("{first}\n{} more of its blobs are damaged:", others.len());
+    for other in others.iter().take(LOSSES_SHOWN) {
+        words = words + "\n  " + other;
+    }
+    if others.len() > LOSSES_SHOWN {
+        words += &format!("\n  and {} others", others.len() - LOSSES_SHOWN);
+    }
+    Failure(1, words)
 }
 
 fn compute_zone(args: ZoneArgs) -> Result<(), Failure> {
