@@ -152,14 +152,24 @@ fn what_is_not_there_is_refused_in_words() {
     let site = site();
     let v = &site.version;
     let deep = site.layer.forest.size()[0];
+    let [root_x, root_y] = site.layer.forest.diamonds(0).next().unwrap().centre();
     let pages = index::pages(&site.layer.forest);
     block(async {
+        assert_eq!(
+            get(&site.url(&format!("/scenes/world/{v}/terrain/points/{root_x}/{root_y}"))).await.status,
+            200
+        );
         for (route, status, word) in [
             ("/nothing".to_owned(), 404, "/scenes"),
             ("/scenes/mars".to_owned(), 404, "/scenes"),
             (format!("/scenes/world/{v}/water/index/0"), 404, "layer"),
             (format!("/scenes/world/{v}/terrain/index/{pages}"), 404, "pages 0 to"),
             (format!("/scenes/world/{v}/terrain/index/-1"), 404, "page"),
+            // The same blob at another address would be kept twice by caches.
+            (format!("/scenes/world/{v}/terrain/index/00"), 404, "page"),
+            (format!("/scenes/world/{v}/terrain/index/+0"), 404, "page"),
+            (format!("/scenes/world/{v}/terrain/points/0{root_x}/{root_y}"), 404, "diamond"),
+            (format!("/scenes/world/{v}/terrain/points/{root_x}/+{root_y}"), 404, "diamond"),
             (format!("/scenes/world/{v}/terrain/index/99999999999999999999"), 404, "page"),
             (format!("/scenes/world/{v}/terrain/points/1/1"), 404, "diamond"),
             (format!("/scenes/world/{v}/terrain/points/{deep}/{deep}"), 404, "diamond"),

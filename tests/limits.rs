@@ -173,6 +173,7 @@ fn without_room_for_an_answer_one_is_told_when_to_come_back() {
 fn requests_have_no_bodies_and_addresses_an_end() {
     let world = World::sample(129, 0.0);
     for (head, status) in [
+        ("GET /health HTTP/1.1\r\n\r\n".to_owned(), "400"),
         ("GET /health HTTP/1.1\r\nHost: here\r\nContent-Length: 5\r\n\r\nhello".to_owned(), "413"),
         (
             "GET /health HTTP/1.1\r\nHost: here\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n".to_owned(),

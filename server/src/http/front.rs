@@ -13,7 +13,9 @@ use super::sendfile::Outbox;
 use super::still::{Activity, Answering};
 use axum::Router;
 use axum::body::{Body, Bytes};
-use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, Request, Response, StatusCode, header};
+use axum::http::{
+    HeaderMap, HeaderName, HeaderValue, Method, Request, Response, StatusCode, Version, header,
+};
 use axum::response::IntoResponse;
 use http_body::{Body as _, Frame, SizeHint};
 use hyper::body::Incoming;
@@ -144,6 +146,10 @@ impl Front {
         if self.stopping.load(Ordering::Relaxed) && uri.path() == "/ready" {
             let detail = "this server is about to stop";
             return Err(Box::new(Refusal::new(StatusCode::SERVICE_UNAVAILABLE, detail).into_response()));
+        }
+        if request.version() == Version::HTTP_11 && !request.headers().contains_key(header::HOST) {
+            let detail = "a request of HTTP/1.1 has a Host header (RFC 9112, section 3.2)";
+            return Err(Box::new(Refusal::new(StatusCode::BAD_REQUEST, detail).into_response()));
         }
         if request.method() == Method::OPTIONS {
             return Err(Box::new(preflight()));

@@ -242,6 +242,12 @@ async fn scene(
     Ok(json(&headers, find_scene(&site, caller, &name)?.scene()))
 }
 
+/// A number of an address as it is written here, so that what it names has one address.
+fn digits(text: &str) -> Option<u32> {
+    let is_plain = text == "0" || text.starts_with(|first| matches!(first, '1'..='9'));
+    text.parse().ok().filter(|_| is_plain)
+}
+
 /// One of the encodings of a layer.
 #[derive(Clone, Copy)]
 struct Encoding {
@@ -335,7 +341,7 @@ async fn page_of(
     let missing = || {
         Refusal::new(StatusCode::NOT_FOUND, format!("no such page: the index has pages 0 to {}", pages - 1))
     };
-    let page: u32 = page.parse().map_err(|_| missing())?;
+    let page = digits(&page).ok_or_else(missing)?;
     let key = Key { layer: number, kind: encoding.page, a: page, b: 0 };
     let blob = site.blobs.get(&store, key).await?.ok_or_else(missing)?;
     let tag = format!("{version}-{number}-{}{page}", encoding.letters[1]);
@@ -355,7 +361,7 @@ async fn index_page(
         return page_of(&site, caller, path, &headers, points).await;
     };
     let missing = || Refusal::new(StatusCode::NOT_FOUND, "no such page: the index of a texture is page 0");
-    if page.parse::<u32>() != Ok(0) {
+    if digits(page) != Some(0) {
         return Err(missing());
     }
     let blob = site.blobs.get(&store, Key::coverage(number)).await?.ok_or_else(missing)?;
@@ -378,8 +384,8 @@ async fn tile(
     let number = find_texture(&store, &texture)
         .ok_or_else(|| missing("no such texture: the scene's description lists them"))?;
     let no_tile = || missing("no such tile: the texture's index tells which there are");
-    let digits = |text: &str| text.parse::<u32>().map_err(|_| no_tile());
-    let tile = Tile { level: digits(&level)?, x: digits(&x)?, y: digits(&y)? };
+    let part = |text: &str| digits(text).ok_or_else(no_tile);
+    let tile = Tile { level: part(&level)?, x: part(&x)?, y: part(&y)? };
     if !store.scene().textures[usize::from(number)].holds(tile) {
         return Err(no_tile());
     }
@@ -413,7 +419,7 @@ async fn diamond_of(
     let (number, layer) = find_layer(&store, &layer)?;
     let encoding = encoding(layer)?;
     let no_diamond = || Refusal::new(StatusCode::NOT_FOUND, "no diamond with a payload has its centre there");
-    let centre = [x.parse().map_err(|_| no_diamond())?, y.parse().map_err(|_| no_diamond())?];
+    let centre = [digits(&x).ok_or_else(no_diamond)?, digits(&y).ok_or_else(no_diamond)?];
     encoding.forest.diamond(centre).ok_or_else(no_diamond)?;
     let key = Key { layer: number, kind: encoding.payload, a: centre[0], b: centre[1] };
     let blob = site.blobs.get(&store, key).await?.ok_or_else(no_diamond)?;
