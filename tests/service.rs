@@ -93,7 +93,7 @@ fn diamonds_of(store: &Path, count: usize) -> (Vec<String>, String) {
 }
 
 /// A counter, or a line of another metric, as `/metrics` shows it.
-fn metric(served: &Served, line: &str) -> f64 {
+pub(crate) fn metric(served: &Served, line: &str) -> f64 {
     let text = get(&format!("{}/metrics", served.address)).text();
     let found = text.lines().find_map(|l| l.strip_prefix(line)?.strip_prefix(' ')?.parse().ok());
     found.unwrap_or(0.0)

@@ -1,6 +1,7 @@
 //! A scene that is built again while it is served: nobody is refused, and a bad version never replaces a good one.
 
 use crate::limits::{answer, connect, request};
+use crate::service::metric;
 use crate::world::{Served, build, options, serve_within};
 use diamantina_client::headless;
 use diamantina_client::terrain::{FrameView, Options, Terrain};
@@ -92,6 +93,7 @@ fn a_scene_built_again_is_swapped_and_a_damaged_one_is_not() {
     publish(&other, &store, &third.version, true);
     sleep(Duration::from_secs(3));
     assert_eq!(version(&served), second, "a damaged version is not served");
+    assert_eq!(metric(&served, "diamantina_checksum_failures_total"), 1.0);
     assert!(ask(&served, &page(&second)).starts_with("HTTP/1.1 200"));
     let fourth = made(&folder.path().join("fourth"), 3.0);
     publish(&folder.path().join("fourth"), &store, &fourth.version, false);

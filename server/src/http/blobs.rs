@@ -149,11 +149,7 @@ impl Blobs {
 
     /// Counts a blob that could not be read.
     pub(super) fn failed(&self, error: &StoreError) {
-        match error {
-            StoreError::Damaged { .. } => self.metrics.checksum_failures.inc(),
-            StoreError::Away { .. } => self.metrics.store_away.inc(),
-            _ => self.metrics.store_errors.inc(),
-        };
+        self.metrics.failed(error);
     }
 
     /// The blob of a key; `None` if there is none. Only who waits for the disk leaves the async thread.

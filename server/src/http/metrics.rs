@@ -3,7 +3,7 @@
 //! Labels have few values, whoever asks for what: routes are templates, and no name, version or token of a scene is one.
 
 use super::Site;
-use crate::store::Shared;
+use crate::store::{Shared, StoreError};
 use axum::extract::State;
 use axum::http::header;
 use axum::response::IntoResponse;
@@ -160,6 +160,15 @@ impl Metrics {
     pub(super) fn ended(&self, route: &'static str, bytes: u64, seconds: f64) {
         self.sent_bytes.get_or_create(&OfRoute { route }).inc_by(bytes);
         self.answer_seconds.get_or_create(&OfRoute { route }).observe(seconds);
+    }
+
+    /// Something of a store could not be read, or is not what was written.
+    pub(super) fn failed(&self, error: &StoreError) {
+        match error {
+            StoreError::Damaged { .. } => self.checksum_failures.inc(),
+            StoreError::Away { .. } => self.store_away.inc(),
+            _ => self.store_errors.inc(),
+        };
     }
 
     /// A connection or a request was refused for a limit.

@@ -128,7 +128,10 @@ impl Scenes {
                 Err(error @ (StoreError::Away { .. } | StoreError::Unanswered { .. })) => {
                     tracing::warn!(scene = name, version, %error, "another version cannot be read through yet");
                 }
-                Err(error) => refuse(&version, &error),
+                Err(error) => {
+                    metrics.failed(&error);
+                    refuse(&version, &error);
+                }
             });
         }
     }
