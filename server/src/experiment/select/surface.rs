@@ -17,7 +17,7 @@ use diamantina_protocol::bitree::Bitree;
 
 /// What is known of a point, in bits: that it is real.
 pub(super) const REAL: u8 = 1;
-/// Of the first triangle in whose middle the point stands, [`is_first`]: in a descent that it has to be judged, afterwards that
+/// Of the first triangle in whose middle the point stands, see [`bit`]: in a descent that it has to be judged, afterwards that
 /// it is split.
 pub(super) const FIRST: u8 = 2;
 /// The same of the other triangle.
