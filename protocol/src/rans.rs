@@ -331,11 +331,12 @@ impl Context {
     fn learn(&mut self, bit: bool) {
         // 1/2 would forget the prior at once; start at 1/4.
         const RATE: [u16; 32] = rates();
-        let rate = u32::from(RATE[usize::from(self.seen.min(31))]);
-        // A share of what it has, so it stays within 16 bits.
-        let share = |of: u16| ((u32::from(of) * rate) >> 16) as u16;
-        self.zero = if bit { self.zero - share(self.zero) } else { self.zero + share(u16::MAX - self.zero) };
-        self.seen = self.seen.saturating_add(1);
+        let rate = u32::from(RATE[usize::from(self.seen) % RATE.len()]);
+        // Probability of what did not come: a share of it goes, so it stays within 16 bits.
+        let turned = if bit { 0 } else { u16::MAX };
+        let other = self.zero ^ turned;
+        self.zero = (other - ((u32::from(other) * rate) >> 16) as u16) ^ turned;
+        self.seen += u8::from(usize::from(self.seen) + 1 < RATE.len());
     }
 }
 

@@ -10,7 +10,8 @@
     reason = "a lattice has fewer than 2^16 points, and its coordinates are within 2^8 of its centre"
 )]
 
-use super::walk::{NONE, Square};
+use super::place::Square;
+use super::walk::NONE;
 use super::{Neighbours, Patch, TRIANGLES_MAX, Vertex};
 use crate::bintree::{Forest, Point};
 use crate::diamond::Diamond;

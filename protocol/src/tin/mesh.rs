@@ -4,7 +4,8 @@
 //! of a patch meet in a point alone, becomes one vertex a fan: then each has at most one gap around it, and
 //! a front can be followed without choices.
 
-use super::walk::{Beyond, NONE, Point, Seed, Square, Within, cross};
+use super::place::{Point, Square, Within, cross};
+use super::walk::{Beyond, NONE, Seed};
 use super::{Neighbours, Patch, PatchError, TRIANGLES_MAX};
 
 /// A triangle's corner: four times its number, and 0 to 2. So no number needs a division; every fourth is none.

@@ -28,6 +28,7 @@
 mod lattice;
 mod mesh;
 mod numbers;
+mod place;
 mod regular;
 mod rows;
 mod walk;
@@ -39,7 +40,8 @@ use crate::rans::{Context, Decoder, Encoder};
 use lattice::Lattice;
 use mesh::Mesh;
 use numbers::{Class, Scale, Tables};
-use walk::{Beyond, Fault, Pass, Point, Seed, Square, Walk, Wire};
+use place::{Point, Square};
+use walk::{Beyond, Fault, Pass, Seed, Walk, Wire, index};
 
 /// The format that this build writes, and the only one that it reads.
 pub const FORMAT: u8 = 2;
@@ -365,7 +367,7 @@ fn encode_mesh(
 /// The patch of a diamond. The bytes may be hostile: whatever is returned has no more than [`TRIANGLES_MAX`]
 /// triangles, each turning left within its child triangle, no two on the same side of an edge, and heights in range.
 ///
-/// Takes 12 MB beside the patch at most, most of it for gates (24 bytes each, two a triangle and two a part, and what a list
+/// Takes 14 MB beside the patch at most, most of it for gates (28 bytes each, two a triangle and two a part, and what a list
 /// takes that has just grown), and time in proportion to the triangles.
 ///
 /// # Errors
@@ -459,18 +461,11 @@ fn gather(walk: &Walk, units: Units, d: Diamond) -> Result<Patch, DecodeError> {
     if odd & 1 == 0 || !units.is_largest(divisor) {
         return Err(DecodeError::Symbols);
     }
-    let counts = walk.counts();
-    let mut ends = counts;
+    let mut ends = walk.triangles().each_ref().map(|of_child| index(of_child.len()));
     for child in 1..4 {
         ends[child] += ends[child - 1];
     }
-    let mut at: [u32; 4] = std::array::from_fn(|child| ends[child] - counts[child]);
-    let mut triangles = vec![[0; 3]; walk.triangles().len()];
-    for (triangle, child) in walk.triangles() {
-        let slot = &mut at[usize::from(child % 4)];
-        triangles[*slot as usize] = triangle;
-        *slot += 1;
-    }
+    let triangles = walk.triangles().concat();
     Ok(Patch { vertices, triangles, ends })
 }
 

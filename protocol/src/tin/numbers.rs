@@ -49,7 +49,7 @@ impl Scale {
     fn learn(&mut self, number: i64) {
         let magnitude = number.abs().min(LEARNT_MAX) as u32;
         // The 15 parts are rounded down: otherwise a mean of less than 16 would never fall.
-        self.mean = self.mean - self.mean.div_ceil(16) + (magnitude << 4);
+        self.mean = self.mean - ((self.mean + 15) >> 4) + (magnitude << 4);
     }
 }
 

@@ -22,10 +22,12 @@
 )]
 
 use super::numbers::Scale;
+use super::place::{
+    Point, Square, Within, cross, difference, dot, expected_height, expected_places, inside, is_left_inside,
+    is_right_inside,
+};
 use super::{TRIANGLES_MAX, VERTICES_MAX};
 use crate::HEIGHT_MAX;
-use crate::bintree::Forest;
-use crate::diamond::Diamond;
 use crate::rans::Context;
 
 pub(super) const NONE: u32 = u32::MAX;
@@ -75,14 +77,6 @@ pub(super) enum Beyond {
     Known(u32),
 }
 
-/// A vertex: in units of the payload, x and y from the diamond's centre, heights from the first one's.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(super) struct Point {
-    pub(super) x: i32,
-    pub(super) y: i32,
-    pub(super) height: i32,
-}
-
 /// Why a walk ends early.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Fault {
@@ -92,68 +86,6 @@ pub(super) enum Fault {
     Place,
     /// More than a patch may have.
     Size,
-}
-
-/// The diamond's square, in units of the payload from its centre.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Square {
-    /// Directions of the local grid's axes.
-    u: [i64; 2],
-    v: [i64; 2],
-    /// The largest coordinate along them.
-    half: i64,
-    upper: bool,
-}
-
-/// In which child triangles a point lies, as bits; then on which straight lines of the square's outer border.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(super) struct Within {
-    pub(super) children: u8,
-    pub(super) outer: u8,
-}
-
-impl Square {
-    /// In lattice units shifted down by `shift`.
-    pub(super) fn new(forest: &Forest, d: Diamond, shift: u32) -> Self {
-        let local = forest.local(d);
-        let half = 1i64 << (forest.root_log2() - 1 - d.level() / 2);
-        Self {
-            u: local.u.map(i64::signum),
-            v: local.v.map(i64::signum),
-            half: half >> shift,
-            upper: local.upper,
-        }
-    }
-
-    /// The same, three times as large: in it lies three times what lies in this one.
-    pub(super) fn thrice(self) -> Self {
-        Self { half: 3 * self.half, ..self }
-    }
-
-    /// Whether units are so large that nothing is left of it.
-    pub(super) fn is_empty(&self) -> bool {
-        self.half == 0
-    }
-
-    /// Where a point lies; no bits of children if it is outside.
-    #[inline(always)]
-    pub(super) fn within(&self, x: i64, y: i64) -> Within {
-        let p = x * self.u[0] + y * self.u[1];
-        let q = x * self.v[0] + y * self.v[1];
-        let h = self.half;
-        if p.abs() > h || q.abs() > h || (!self.upper && q > p) {
-            return Within::default();
-        }
-        let bits =
-            |[a, b, c, d]: [bool; 4]| u8::from(a) | u8::from(b) << 1 | u8::from(c) << 2 | u8::from(d) << 3;
-        let children = bits([-q >= p.abs(), p >= q.abs(), q >= p.abs(), -p >= q.abs()]);
-        let outer = bits([q == -h, p == h, q == h, p == -h]);
-        if self.upper {
-            Within { children, outer }
-        } else {
-            Within { children: children & 0b0011, outer: outer | u8::from(p == q) << 4 }
-        }
-    }
 }
 
 /// What of a gate is left to do.
@@ -168,8 +100,10 @@ enum State {
 
 #[derive(Debug, Clone, Copy)]
 struct Gate {
-    /// Where it starts; it ends where the next one starts.
+    /// Where it starts.
     origin: u32,
+    /// Where it ends, and the next one starts: at hand, so that nobody need wait for that one.
+    target: u32,
     prev: u32,
     next: u32,
     /// The third vertex of the triangle on its right.
@@ -257,57 +191,14 @@ pub(super) struct Walk {
     holes: bool,
     places: Vec<Placed>,
     gates: Vec<Gate>,
-    /// The triangles, with the child triangle of each, and how many each of these has.
-    triangles: Vec<([u32; 3], u8)>,
-    counts: [u32; 4],
+    /// The triangles of each child triangle, and how many there are in all.
+    triangles: [Vec<[u32; 3]>; 4],
+    count: usize,
+    /// The lowest child triangle of the part of the mesh that is under way.
+    lowest: u8,
     /// Inner borders found.
     borders: usize,
     contexts: Contexts,
-}
-
-#[inline(always)]
-fn difference(a: Point, b: Point) -> [i64; 2] {
-    // In the square they are of 26 bits; of what lies elsewhere, and is refused for that, it does not matter.
-    [b.x.wrapping_sub(a.x), b.y.wrapping_sub(a.y)].map(i64::from)
-}
-
-/// Twice the area of the triangle `a`, `b`, `c`; above 0 if it turns left.
-#[inline(always)]
-pub(super) fn cross(a: Point, b: Point, c: Point) -> i64 {
-    let (u, v) = (difference(a, b), difference(a, c));
-    u[0] * v[1] - u[1] * v[0]
-}
-
-#[inline(always)]
-fn dot(a: Point, b: Point, c: Point) -> i64 {
-    let (u, v) = (difference(a, b), difference(a, c));
-    u[0] * v[0] + u[1] * v[1]
-}
-
-/// Whether the direction from `at` to `to` lies strictly inside the turn left from that to `from` to that to `until`:
-/// a full turn where these two are the same.
-#[inline(always)]
-fn inside(at: Point, from: Point, until: Point, to: Point) -> bool {
-    let turn = cross(at, from, until);
-    let (after, before) = (cross(at, from, to), cross(at, to, until));
-    if turn == 0 && dot(at, from, until) > 0 {
-        return after != 0 || dot(at, from, to) < 0;
-    }
-    // Without branches: which way a front turns is as random as the mesh, and would be mispredicted.
-    let (left, right) = (after > 0, before > 0);
-    (left & right) | ((turn <= 0) & (left | right))
-}
-
-/// [`inside`] of what is known to lie to the left of `from`, seen from `at`.
-#[inline(always)]
-fn is_left_inside(at: Point, from: Point, until: Point, to: Point) -> bool {
-    (cross(at, from, until) <= 0) | (cross(at, to, until) > 0)
-}
-
-/// [`inside`] of what is known to have `until` to its left.
-#[inline(always)]
-fn is_right_inside(at: Point, from: Point, until: Point, to: Point) -> bool {
-    (cross(at, from, until) <= 0) | (cross(at, from, to) > 0)
 }
 
 impl Walk {
@@ -318,10 +209,11 @@ impl Walk {
             holes,
             places: Vec::with_capacity(expected * 5 / 8),
             gates: Vec::with_capacity(expected * 7 / 4),
-            triangles: Vec::with_capacity(expected),
-            counts: [0; 4],
+            triangles: [(); 4].map(|()| Vec::with_capacity(expected / 4)),
+            count: 0,
+            lowest: u8::MAX,
             borders: 0,
-            contexts: Contexts::new(square.half),
+            contexts: Contexts::new(square.half()),
             square,
         }
     }
@@ -331,14 +223,9 @@ impl Walk {
         self.places.iter().map(|placed| placed.point)
     }
 
-    /// The triangles, in the order in which they were met, with the child triangle of each.
-    pub(super) fn triangles(&self) -> impl ExactSizeIterator<Item = ([u32; 3], u8)> + '_ {
-        self.triangles.iter().copied()
-    }
-
-    /// How many triangles each child triangle has.
-    pub(super) fn counts(&self) -> [u32; 4] {
-        self.counts
+    /// The triangles of each child triangle, in the order in which they were met.
+    pub(super) fn triangles(&self) -> &[Vec<[u32; 3]>; 4] {
+        &self.triangles
     }
 
     /// Walks over a whole mesh.
@@ -349,8 +236,9 @@ impl Walk {
             if !pass.bit(&mut self.contexts.more, seed.is_some()) {
                 break;
             }
-            let first = self.triangles.len();
+            self.lowest = u8::MAX;
             self.begin(pass, seed.unwrap_or_default())?;
+            let first = self.lowest;
             while at < self.gates.len() {
                 if self.gates[at].state == State::Open {
                     self.step(pass, at)?;
@@ -358,11 +246,10 @@ impl Walk {
                 at += 1;
             }
             // Each part of the mesh begins in its lowest child triangle, and parts come in that order.
-            let ((_, seed), rest) = self.triangles[first..].split_first().ok_or(Fault::Symbols)?;
-            if *seed < least || rest.iter().any(|(_, child)| child < seed) {
+            if first < least || self.lowest < first {
                 return Err(Fault::Symbols);
             }
-            least = *seed;
+            least = first;
         }
         if self.holes == (self.borders > 0) && self.fans_are_whole() { Ok(()) } else { Err(Fault::Symbols) }
     }
@@ -394,8 +281,9 @@ impl Walk {
         // Two gates, one on each side of the edge. The first has a triangle for sure.
         let gate = index(self.gates.len());
         let outer = self.places[first].within.outer & self.places[first + 1].within.outer;
-        self.push(index(first), outer, [gate + 1; 2], NONE, seed.marks[0]);
-        self.push(index(first + 1), outer, [gate; 2], index(first + 2), seed.marks[1]);
+        let ends = [index(first), index(first + 1)];
+        self.push(ends, outer, [gate + 1; 2], NONE, seed.marks[0]);
+        self.push([ends[1], ends[0]], outer, [gate; 2], index(first + 2), seed.marks[1]);
         let beyond = pass.beyond(seed.marks[0]);
         self.grow(pass, &self.here(gate as usize), beyond)
     }
@@ -417,13 +305,20 @@ impl Walk {
         Ok(placed)
     }
 
-    /// A new gate that begins at a vertex, between two gates; with the lines of the square's border on which both of its
-    /// ends lie.
+    /// A new gate from one vertex to another, between two gates; with the lines of the square's border on which both of
+    /// its ends lie.
     #[inline(always)]
-    fn push(&mut self, origin: u32, outer: u8, [prev, next]: [u32; 2], behind: u32, mark: u32) -> u32 {
+    fn push(
+        &mut self,
+        [origin, target]: [u32; 2],
+        outer: u8,
+        [prev, next]: [u32; 2],
+        behind: u32,
+        mark: u32,
+    ) -> u32 {
         let state = if outer == 0 { State::Open } else { State::Border };
         let number = index(self.gates.len());
-        self.gates.push(Gate { origin, prev, next, behind, mark, state });
+        self.gates.push(Gate { origin, target, prev, next, behind, mark, state });
         number
     }
 
@@ -432,12 +327,12 @@ impl Walk {
     #[inline(always)]
     fn sides(&mut self, here: &Here, [v, after, before]: [u32; 3], outer: u8, marks: [u32; 2]) -> [u32; 2] {
         let state = |end: &Placed| if end.within.outer & outer == 0 { State::Open } else { State::Border };
-        let Gate { origin, prev, next, .. } = here.gate;
+        let Gate { origin: a, target: b, prev, next, .. } = here.gate;
         let [to, from] = [0, 1].map(|i| index(self.gates.len()) + i);
-        let behind = here.next.origin;
+        let [mark, last] = marks;
         self.gates.extend_from_slice(&[
-            Gate { origin, prev, next: after, behind, mark: marks[0], state: state(&here.a) },
-            Gate { origin: v, prev: before, next, behind: origin, mark: marks[1], state: state(&here.b) },
+            Gate { origin: a, target: v, prev, next: after, behind: b, mark, state: state(&here.a) },
+            Gate { origin: v, target: b, prev: before, next, behind: a, mark: last, state: state(&here.b) },
         ]);
         self.gates[prev as usize].next = to;
         self.gates[next as usize].prev = from;
@@ -457,8 +352,8 @@ impl Walk {
     fn here(&self, at: usize) -> Here {
         let gate = self.gates[at];
         let (prev, next) = (self.gate(gate.prev), self.gate(gate.next));
-        let [a, b, before, after] = [gate.origin, next.origin, prev.origin, self.gate(next.next).origin]
-            .map(|vertex| self.places[vertex as usize]);
+        let [a, b, before, after] =
+            [gate.origin, gate.target, prev.origin, next.target].map(|vertex| self.places[vertex as usize]);
         let areas = [before, after].map(|v| cross(a.point, b.point, v.point));
         Here { at, gate, prev, next, a, b, before, after, areas }
     }
@@ -489,8 +384,7 @@ impl Walk {
         if left > 0 && pass.bit(&mut self.contexts.left[left][right], known == prev.origin) {
             return self.join_left(pass, &here);
         }
-        let end = self.gate(next.next).origin;
-        if right > 0 && pass.bit(&mut self.contexts.right[right], known == end) {
+        if right > 0 && pass.bit(&mut self.contexts.right[right], known == next.target) {
             return self.join_right(pass, &here);
         }
         self.join_other(pass, at, known)
@@ -503,13 +397,14 @@ impl Walk {
         if within == 0 || cross(here.a.point, here.b.point, apex.point) <= 0 {
             return Err(Fault::Place);
         }
-        if self.triangles.len() >= TRIANGLES_MAX {
+        if self.count >= TRIANGLES_MAX {
             return Err(Fault::Size);
         }
         // Closed child triangles share lines only, so there is one bit.
         let child = within.trailing_zeros() as u8;
-        self.triangles.push(([here.gate.origin, here.next.origin, v], child));
-        self.counts[usize::from(child % 4)] += 1;
+        self.triangles[usize::from(child % 4)].push([here.gate.origin, here.gate.target, v]);
+        self.count += 1;
+        self.lowest = self.lowest.min(child);
         self.gates[here.at].state = State::Done;
         Ok(())
     }
@@ -523,7 +418,8 @@ impl Walk {
         let length = b.x.abs_diff(a.x).max(b.y.abs_diff(a.y)).max(1).ilog2() as usize;
         let length = length.min(LENGTHS - 1);
         let rules = expected_places(a, b, behind);
-        let [x, y] = rules[usize::from(self.contexts.misses[1] < self.contexts.misses[0])];
+        let is_second = self.contexts.misses[1] < self.contexts.misses[0];
+        let [x, y] = [0, 1].map(|i| if is_second { rules[1][i] } else { rules[0][i] });
         let [along_x, along_y] = &mut self.contexts.places[length];
         let x = x + pass.number(along_x, i64::from(wanted.x) - x)?;
         let y = y + pass.number(along_y, i64::from(wanted.y) - y)?;
@@ -564,7 +460,8 @@ impl Walk {
             return Ok(());
         }
         let outer = apex.within.outer & here.b.within.outer;
-        let from = self.push(v, outer, [prev.prev, gate.next], gate.origin, pass.marks(gate.mark)[1]);
+        let links = [prev.prev, gate.next];
+        let from = self.push([v, gate.target], outer, links, gate.origin, pass.marks(gate.mark)[1]);
         self.gates[prev.prev as usize].next = from;
         self.gates[gate.next as usize].prev = from;
         Ok(())
@@ -574,17 +471,17 @@ impl Walk {
     #[inline(always)]
     fn join_right(&mut self, pass: &impl Pass, here: &Here) -> Result<(), Fault> {
         let Here { gate, next, after: apex, .. } = *here;
-        let beyond = self.gate(next.next);
-        let after = self.point(self.gate(beyond.next).origin);
+        let v = next.target;
+        let after = self.point(self.gate(next.next).target);
         let room = is_right_inside(apex.point, after, here.b.point, here.a.point);
         if !room || !here.start_has_room(apex.point) {
             return Err(Fault::Place);
         }
-        self.triangle(here, beyond.origin, &apex)?;
+        self.triangle(here, v, &apex)?;
         self.gates[gate.next as usize].state = State::Done;
         let outer = here.a.within.outer & apex.within.outer;
         let links = [gate.prev, next.next];
-        let to = self.push(gate.origin, outer, links, next.origin, pass.marks(gate.mark)[0]);
+        let to = self.push([gate.origin, v], outer, links, gate.target, pass.marks(gate.mark)[0]);
         self.gates[gate.prev as usize].next = to;
         self.gates[next.next as usize].prev = to;
         Ok(())
@@ -593,8 +490,8 @@ impl Walk {
     /// Whether a triangle's corner fits in at the start of the gate `out`.
     fn fits(&self, here: &Here, out: u32) -> bool {
         let gate = self.gate(out);
-        let [v, before, after] = [gate.origin, self.gate(gate.prev).origin, self.gate(gate.next).origin]
-            .map(|vertex| self.point(vertex));
+        let [v, before, after] =
+            [gate.origin, self.gate(gate.prev).origin, gate.target].map(|vertex| self.point(vertex));
         gate.state != State::Done
             && inside(v, after, before, here.a.point)
             && inside(v, after, before, here.b.point)
@@ -671,60 +568,12 @@ fn angle(here: &Here, v: &Placed, sine: i64, wanted: bool) -> usize {
     // 45 degrees, some 63, 90, 135. Without branches, as above.
     let class = 1
         + usize::from(cosine <= sine)
-        + usize::from(cosine <= sine / 2)
+        + usize::from(2 * cosine <= sine)
         + usize::from(cosine <= 0)
         + usize::from(cosine <= -sine);
     class * usize::from((sine > 0) & (within != 0) & wanted)
 }
 
-/// Where the third vertex of a triangle beyond a gate is expected, by two rules: as far as that of the triangle behind,
-/// which regular meshes follow; or half as far as the gate is long, straight ahead.
-#[inline(always)]
-fn expected_places(a: Point, b: Point, behind: Option<Point>) -> [[i64; 2]; 2] {
-    let (x, y) = (i64::from(a.x) + i64::from(b.x), i64::from(a.y) + i64::from(b.y));
-    let [dx, dy] = difference(a, b);
-    let ahead = [(x - dy) >> 1, (y + dx) >> 1];
-    [behind.map_or(ahead, |c| [x - i64::from(c.x), y - i64::from(c.y)]), ahead]
-}
-
-/// The height of the plane of the triangle on the gate's right, seen from beyond.
-#[inline(always)]
-fn expected_height(a: Point, b: Point, behind: Option<Point>, x: i64, y: i64) -> i64 {
-    let [from, to] = [a, b].map(|p| i64::from(p.height));
-    let Some(c) = behind else { return (from + to) / 2 };
-    let (along, back) = (difference(a, b), difference(a, c));
-    let here = [x - i64::from(a.x), y - i64::from(a.y)];
-    let whole = back[0] * along[1] - back[1] * along[0];
-    let (s, t) = (back[0] * here[1] - back[1] * here[0], here[0] * along[1] - here[1] * along[0]);
-    // 34 bits and 3 and those of a difference of heights fit in 63.
-    let shift = (64 - whole.leading_zeros()).saturating_sub(34);
-    let whole = (whole >> shift).max(1);
-    let clamp = |part: i64| (part >> shift).clamp(-4 * whole, 4 * whole);
-    let (s, t) = (clamp(s), clamp(t));
-    from + (s * (to - from) + t * (i64::from(c.height) - from)).div_euclid(whole)
-}
-
-fn index(count: usize) -> u32 {
+pub(super) fn index(count: usize) -> u32 {
     u32::try_from(count).unwrap_or(NONE)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use proptest::prelude::*;
-
-    proptest! {
-        #[test]
-        fn what_lies_on_the_known_side_is_inside_as_anything_is(xy in prop::array::uniform8(-4i32..=4)) {
-            let [at, from, until, to] = [0, 2, 4, 6].map(|i| Point { x: xy[i], y: xy[i + 1], height: 0 });
-            prop_assume!(difference(at, from) != [0, 0] && difference(at, until) != [0, 0]);
-            let expected = inside(at, from, until, to);
-            if cross(at, from, to) > 0 {
-                prop_assert_eq!(is_left_inside(at, from, until, to), expected);
-            }
-            if cross(at, to, until) > 0 {
-                prop_assert_eq!(is_right_inside(at, from, until, to), expected);
-            }
-        }
-    }
 }
