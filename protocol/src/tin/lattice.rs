@@ -41,7 +41,7 @@ pub(super) struct Lattice {
 }
 
 /// A row of points.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Row {
     pub(super) first: i32,
     pub(super) last: i32,
@@ -185,14 +185,27 @@ impl Lattice {
 
     /// The patch with these heights, row by row.
     pub(super) fn patch(&self, heights: &[i32]) -> Patch {
+        let mut heights = heights.iter().copied();
+        let vertices = self.vertices(|_| heights.next().unwrap_or(0));
+        Patch { vertices, triangles: self.all(), ends: self.ends() }
+    }
+
+    /// The points with their heights, row by row.
+    fn vertices(&self, mut height: impl FnMut(Point) -> i32) -> Vec<Vertex> {
         let mut vertices = Vec::with_capacity(self.points);
-        let mut heights = heights.iter();
         for (y, row) in (self.south..).zip(&self.rows) {
             let place = |w: i32, i: usize| self.centre[i].wrapping_add_signed(w << self.shift);
             let y = place(y, 1);
-            let points = (row.first..=row.last).zip(heights.by_ref());
-            vertices.extend(points.map(|(x, height)| Vertex { x: place(x, 0), y, height: *height }));
+            vertices.extend((row.first..=row.last).map(|x| {
+                let x = place(x, 0);
+                Vertex { x, y, height: height([x, y]) }
+            }));
         }
+        vertices
+    }
+
+    /// The triangles, by child triangles.
+    fn all(&self) -> Vec<[u32; 3]> {
         let mut next = self.begins();
         let mut triangles = vec![[0; 3]; self.triangles];
         self.each(|child, _, _, triangle| {
@@ -200,7 +213,13 @@ impl Lattice {
             triangles[*number as usize] = triangle;
             *number += 1;
         });
-        Patch { vertices, triangles, ends: self.ends() }
+        triangles
+    }
+
+    /// Whether another one has the same triangles.
+    fn is_like(&self, other: &Self) -> bool {
+        let shape = |of: &Self| (of.thrice, of.south, of.is_centre_cut_so);
+        shape(self) == shape(other) && self.rows == other.rows
     }
 
     /// Goes through all triangles: the child triangle of each, its cell, which of the cell's it is, and its points.
@@ -308,14 +327,44 @@ impl Patch {
     pub fn lattice(
         forest: &Forest,
         d: Diamond,
-        mut height: impl FnMut(Point) -> i32,
+        height: impl FnMut(Point) -> i32,
     ) -> Option<(Self, Neighbours)> {
+        Lattices::default().patch(forest, d, height)
+    }
+}
+
+/// The most shapes that are kept: diamonds of a level have four, twice as many on the forest's border, cut in two ways.
+const SHAPES_MAX: usize = 32;
+
+/// Makes the patches of whole lattices: of those that have the same triangles, the first alone triangle by triangle. Takes
+/// 28 bytes a triangle of up to 32 of them.
+#[derive(Default)]
+pub struct Lattices {
+    shapes: Vec<(Lattice, Vec<[u32; 3]>, Neighbours)>,
+}
+
+impl Lattices {
+    /// [`Patch::lattice`].
+    #[must_use]
+    pub fn patch(
+        &mut self,
+        forest: &Forest,
+        d: Diamond,
+        height: impl FnMut(Point) -> i32,
+    ) -> Option<(Patch, Neighbours)> {
         let lattice = Lattice::new(forest, d, 0)?;
-        let mut patch = lattice.patch(&vec![0; lattice.points]);
-        for vertex in &mut patch.vertices {
-            vertex.height = height([vertex.x, vertex.y]);
-        }
-        Some((patch, lattice.neighbours()))
+        let (vertices, ends) = (lattice.vertices(height), lattice.ends());
+        let known = self.shapes.iter().position(|(shape, ..)| shape.is_like(&lattice));
+        let known = known.unwrap_or_else(|| {
+            if self.shapes.len() >= SHAPES_MAX {
+                self.shapes.clear();
+            }
+            let (triangles, neighbours) = (lattice.all(), lattice.neighbours());
+            self.shapes.push((lattice, triangles, neighbours));
+            self.shapes.len() - 1
+        });
+        let (_, triangles, neighbours) = &self.shapes[known];
+        Some((Patch { vertices, triangles: triangles.clone(), ends }, neighbours.clone()))
     }
 }
 

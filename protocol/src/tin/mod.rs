@@ -38,6 +38,7 @@ use crate::bintree::Forest;
 use crate::diamond::Diamond;
 use crate::rans::{Context, Decoder, Encoder};
 use lattice::Lattice;
+pub use lattice::Lattices;
 use mesh::Mesh;
 use numbers::{Class, Scale, Tables};
 use place::{Point, Square};
@@ -256,6 +257,19 @@ pub fn encode_with(
     match lattice::of(forest, d, patch) {
         Some((lattice, heights)) => encode_lattice(&lattice, heights),
         None => encode_mesh(forest, d, patch, neighbours),
+    }
+}
+
+/// [`encode`] of what [`Lattices`] has made: its triangles are not looked at.
+///
+/// # Errors
+/// When a height is beyond the range of heights.
+pub fn encode_whole(forest: &Forest, d: Diamond, patch: &Patch) -> Result<Vec<u8>, PatchError> {
+    match Lattice::new(forest, d, 0) {
+        Some(lattice) if lattice.points() == patch.vertices.len() => {
+            encode_lattice(&lattice, patch.vertices.iter().map(|v| v.height).collect())
+        }
+        _ => encode(forest, d, patch),
     }
 }
 

@@ -17,7 +17,7 @@ pub(super) struct Point {
 }
 
 /// The diamond's square, in units of the payload from its centre.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Square {
     /// Directions of the local grid's axes.
     u: [i64; 2],

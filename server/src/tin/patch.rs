@@ -10,7 +10,7 @@ use super::{Metric, Rules, Vertex};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
-use diamantina_protocol::tin::{Neighbours, Patch, PatchError, encode_with};
+use diamantina_protocol::tin::{Lattices, Neighbours, Patch, PatchError, encode_whole, encode_with};
 use std::collections::{HashMap, HashSet};
 
 /// An edge of the border, from vertex to vertex, and the points of the source's border that it stands for, but for those
@@ -56,6 +56,8 @@ pub struct Merged {
     untouched: Vec<bool>,
     /// Those of the patch, if they are known.
     neighbours: Option<Neighbours>,
+    /// Whether it is what [`Lattices`] has made.
+    is_whole: bool,
 }
 
 impl Merged {
@@ -64,6 +66,9 @@ impl Merged {
     /// # Errors
     /// When it is no patch of this diamond.
     pub fn encode(&mut self, forest: &Forest, d: Diamond) -> Result<Vec<u8>, PatchError> {
+        if self.is_whole {
+            return encode_whole(forest, d, &self.patch);
+        }
         let neighbours = self.neighbours.take();
         let neighbours =
             neighbours.unwrap_or_else(|| Neighbours::of(&self.patch.triangles, self.patch.vertices.len()));
@@ -322,7 +327,7 @@ fn stays(forest: &Forest, d: Diamond, ground: Ground<'_>, rules: &Rules) -> bool
 }
 
 /// The mesh of a diamond all of whose children have the source's own, if that is left as it is where nothing may be lost.
-/// `known`: of which children that has been found out.
+/// `known`: of which children that has been found out; `lattices`: what has been made.
 #[must_use]
 pub fn lattice(
     forest: &Forest,
@@ -330,19 +335,21 @@ pub fn lattice(
     ground: Ground<'_>,
     rules: &Rules,
     known: &mut HashMap<Diamond, bool>,
+    lattices: &mut Lattices,
 ) -> Option<Merged> {
     for child in forest.children(d).into_iter().flatten() {
         if !*known.entry(child).or_insert_with(|| keeps(forest, child, ground, rules)) {
             return None;
         }
     }
-    let (patch, neighbours) = Patch::lattice(forest, d, |[x, y]| ground.at(x, y))?;
+    let (patch, neighbours) = lattices.patch(forest, d, |[x, y]| ground.at(x, y))?;
     let count = patch.vertices.len();
     Some(Merged {
         errors: vec![0.0; patch.triangles.len()],
         needs: vec![0; count],
         untouched: vec![true; count],
         neighbours: Some(neighbours),
+        is_whole: true,
         patch,
         ..Merged::default()
     })

@@ -13,6 +13,7 @@ use crate::tin::{Ground, Merged, Simplified, Tin, Until, half_of, lattice, merge
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::message::PAYLOAD_BYTES_MAX;
+use diamantina_protocol::tin::Lattices;
 use rayon::prelude::*;
 use std::collections::HashMap;
 
@@ -33,6 +34,8 @@ struct Finest {
     halves: HashMap<Diamond, (Simplified, f64)>,
     /// Whether the source's own mesh is left as it is.
     keep: HashMap<Diamond, bool>,
+    /// What has been made of these.
+    lattices: Lattices,
 }
 
 /// The rectangle around some boxes.
@@ -179,8 +182,8 @@ impl Tins<'_> {
     fn of_finest(&self, deep: &Forest, d: Diamond, ground: Ground<'_>, finest: &mut Finest) -> Merged {
         let until = self.finest_limit(ground);
         let loses = matches!(until, Until::Error { vertical, .. } if vertical > 0.0);
-        if !loses && let Some(lattice) = lattice(deep, d, ground, &self.rules(), &mut finest.keep) {
-            return lattice;
+        if !loses && let Some(whole) = self.whole(deep, d, ground, finest) {
+            return whole;
         }
         let children = deep.children(d);
         for c in children.into_iter().flatten() {
@@ -193,6 +196,11 @@ impl Tins<'_> {
             finest.halves.insert(c, (simplified, vertical));
         }
         quarters(deep, d, children, finest)
+    }
+
+    /// The mesh of a diamond of the finest payloads if it is the source's own.
+    fn whole(&self, deep: &Forest, d: Diamond, ground: Ground<'_>, finest: &mut Finest) -> Option<Merged> {
+        lattice(deep, d, ground, &self.rules(), &mut finest.keep, &mut finest.lattices)
     }
 
     /// The mesh of a diamond whose children are the first to be simplified.
