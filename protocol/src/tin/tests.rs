@@ -237,6 +237,19 @@ proptest! {
     }
 }
 
+/// One after the other, whatever their shapes.
+#[test]
+fn lattices_made_like_others_are_as_if_made_alone() {
+    let forest = Forest::new(5, 2, [2, 1]).unwrap();
+    let mut lattices = Lattices::default();
+    let height = |[x, y]: [u32; 2]| (7 * x + x * y) as i32;
+    for d in (0..forest.levels()).flat_map(|level| forest.diamonds(level)) {
+        let (patch, neighbours) = lattices.patch(&forest, d, height).unwrap();
+        assert_eq!(encode_whole(&forest, d, &patch), encode(&forest, d, &patch));
+        assert_eq!(Some((patch, neighbours)), Patch::lattice(&forest, d, height));
+    }
+}
+
 /// Nothing can be said in two ways.
 #[test]
 fn a_whole_lattice_told_by_a_walk_is_refused() {
