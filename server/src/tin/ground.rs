@@ -75,22 +75,28 @@ impl Ground<'_> {
 
     /// [`Ground::distance`] of a triangle whose corners are known to be samples.
     #[must_use]
+    #[inline]
     pub(super) fn distance_within(&self, [a, b, c]: [Vertex; 3], limit: f64) -> f64 {
-        let doubled = turn(a, b, c);
+        match turn(a, b, c) {
+            // No other lattice point has room.
+            1 => 0.0,
+            doubled => self.distance_in([a, b, c], doubled, limit),
+        }
+    }
+
+    /// Likewise, given twice its area.
+    fn distance_in(&self, [a, b, c]: [Vertex; 3], doubled: i64, limit: f64) -> f64 {
         // Seven of ten are such: halves and thirds part them into least ones.
-        if matches!(doubled, 1..=4 | 6 | 8) {
+        if doubled == 2 {
+            return self.distance_halfway([a, b, c]);
+        }
+        if matches!(doubled, 3 | 4 | 6 | 8) {
             let scaled = |v: Vertex| Place { x: v.x, y: v.y, height: doubled * i64::from(v.height) };
             return self.away_in([scaled(a), scaled(b), scaled(c)], doubled, doubled) as f64 / doubled as f64;
         }
         let step = |w: u32, o: u32| w.wrapping_sub(o).cast_signed();
         let local = |v: Vertex| [step(v.x, self.origin[0]), step(v.y, self.origin[1])];
         let sides = Sides::new([local(a), local(b), local(c)]);
-        // A row with one corner alone has no other sample.
-        let low = sides.low[1] + i32::from(sides.low[1] != sides.middle[1]);
-        let high = sides.high[1] - i32::from(sides.high[1] != sides.middle[1]);
-        if low > high {
-            return 0.0;
-        }
         let doubled = doubled as f64;
         // The plane, times D: D h = D h_a + east (x - x_a) + north (y - y_a).
         let of_side = |v: Vertex| {
@@ -102,13 +108,26 @@ impl Ground<'_> {
         let corner = local(a).map(f64::from);
         let start = f64::from(a.height) * doubled - east * corner[0] - north * corner[1];
         let plane = Plane { start, east, north, doubled };
-        let spans = sides.spans();
-        let worst = self.worst::<false>(&plane, &spans, [low.max(0), high], limit * doubled);
+        let worst = self.worst::<false>(&plane, &sides, limit * doubled);
         // No height is as far off, but what stands for none is.
         if worst >= doubled * NODATA_AWAY {
-            return self.worst::<true>(&plane, &spans, [low.max(0), high], limit * doubled) / doubled;
+            return self.worst::<true>(&plane, &sides, limit * doubled) / doubled;
         }
         worst / doubled
+    }
+
+    /// Likewise of a triangle that has one other lattice point: in the middle of a side.
+    fn distance_halfway(&self, [a, b, c]: [Vertex; 3]) -> f64 {
+        let is_whole = |p: Vertex, q: Vertex| ((p.x ^ q.x) | (p.y ^ q.y)) & 1 == 0;
+        let (p, q) = if is_whole(a, b) {
+            (a, b)
+        } else if is_whole(b, c) {
+            (b, c)
+        } else {
+            (c, a)
+        };
+        let middle = Vertex { x: (p.x + q.x) / 2, y: (p.y + q.y) / 2, height: 0 };
+        self.sample(middle).map_or(0.0, |h| 0.5 * f64::from((2 * h - p.height - q.height).abs()))
     }
 
     /// The largest distance of the samples of a triangle whose `area`, twice the one in plan, is even or 3 or 1, and half
@@ -145,37 +164,69 @@ impl Ground<'_> {
         sample.map_or(0, |h| (scale * i64::from(h) - at.height).abs())
     }
 
-    /// The largest distance of the samples in some rows, times D; or something above `limit`. Whether samples without
-    /// height are looked for.
-    #[inline(always)]
-    fn worst<const GAPS: bool>(&self, plane: &Plane, spans: &Spans, rows: [i32; 2], limit: f64) -> f64 {
-        let last = self.width as i32 - 1;
+    /// The largest distance of a triangle's samples, times D; or something above `limit`. Whether samples without height are
+    /// looked for.
+    fn worst<const GAPS: bool>(&self, plane: &Plane, sides: &Sides, limit: f64) -> f64 {
+        let Sides { low, middle, high, is_east } = *sides;
+        let all = Line::new(low, high);
         let mut worst = [0.0f64; LANES];
-        let mut since = 0;
-        for y in rows[0]..=rows[1] {
-            let [from, to] = spans.at(y);
-            let (from, to) = (from.max(0), to.min(last));
-            if from > to {
+        // A row with one corner alone has no other sample.
+        let (first, last) =
+            (low[1] + i32::from(low[1] != middle[1]), high[1] - i32::from(high[1] != middle[1]));
+        for (from, to, rows) in
+            [(low, middle, [first, middle[1] - 1]), (middle, high, [first.max(middle[1]), last])]
+        {
+            let rows = [rows[0].max(0), rows[1]];
+            if rows[0] > rows[1] {
                 continue;
             }
-            let at = y as usize * self.width;
-            // Rows beyond the rectangle have no samples.
-            let Some(row) = self.heights.get(at + from as usize..at + to as usize + 1) else { break };
-            let start = plane.start + plane.north * f64::from(y) + plane.east * f64::from(from);
-            if row.len() < 2 * LANES {
-                run_short::<GAPS>(row, start, plane, &mut worst[0]);
-            } else {
-                run::<GAPS>(row, start, plane, &mut worst);
-            }
-            since += row.len();
-            if since > SAMPLES_BETWEEN {
-                since = 0;
-                if most(worst) > limit {
-                    break;
-                }
+            let by = Line::new(from, to);
+            let spans = if is_east { Spans::new(&all, &by, rows[0]) } else { Spans::new(&by, &all, rows[0]) };
+            self.worst_of_rows::<GAPS>(plane, spans, rows, limit, &mut worst);
+            if most(worst) > limit {
+                break;
             }
         }
         most(worst)
+    }
+
+    /// Likewise of some rows between two sides.
+    #[inline(always)]
+    fn worst_of_rows<const GAPS: bool>(
+        &self,
+        plane: &Plane,
+        mut spans: Spans,
+        rows: [i32; 2],
+        limit: f64,
+        worst: &mut [f64; LANES],
+    ) {
+        let east = self.width as i32 - 1;
+        let mut since = 0;
+        let mut at = rows[0] as usize * self.width;
+        let mut y = f64::from(rows[0]);
+        for _ in rows[0]..=rows[1] {
+            let (from, to) = (nearest(spans.west).max(0), nearest(spans.east).min(east));
+            if from <= to {
+                // Rows beyond the rectangle have no samples.
+                let Some(row) = self.heights.get(at + from as usize..=at + to as usize) else { break };
+                let start = plane.start + plane.north * y + plane.east * f64::from(from);
+                if row.len() < 2 * LANES {
+                    run_short::<GAPS>(row, start, plane, &mut worst[0]);
+                } else {
+                    run::<GAPS>(row, start, plane, worst);
+                }
+                since += row.len();
+                if since > SAMPLES_BETWEEN {
+                    since = 0;
+                    if most(*worst) > limit {
+                        break;
+                    }
+                }
+            }
+            spans.next();
+            y += 1.0;
+            at += self.width;
+        }
     }
 }
 
@@ -253,25 +304,33 @@ impl Line {
     }
 }
 
-/// Which samples of a row lie between the sides.
+/// Which samples of a row lie between two sides: from the whole number nearest to one place to that nearest to another,
+/// edges included.
 struct Spans {
-    all: Line,
-    /// Up to the middle, and from there on.
-    by: [Line; 2],
-    middle: i32,
-    is_east: bool,
+    west: f64,
+    east: f64,
+    /// From one row to the next.
+    slopes: [f64; 2],
 }
 
 impl Spans {
-    /// The first and the last sample of a row that lie in the triangle, edges included. The places are rounded by less
-    /// than 2^-26, and none of them is as near to a whole number without being one as 2^-25: sides are at most as high.
+    /// Of a row. Places are rounded by less than 2^-40, and in going on over 2^13 rows by less than 2^-26 in all; none of
+    /// them is as near to a whole number without being one as 2^-25: sides are at most as high.
     #[inline(always)]
-    fn at(&self, y: i32) -> [i32; 2] {
-        let by = &self.by[usize::from(y >= self.middle)];
-        let [west, east] = if self.is_east { [&self.all, by] } else { [by, &self.all] };
+    fn new(west: &Line, east: &Line, y: i32) -> Self {
         let y = f64::from(y);
         // Half a cell on, the nearest whole number is the next one.
-        [nearest(west.at(y) + (0.5 - west.least)), nearest(east.at(y) - (0.5 - east.least))]
+        Self {
+            west: west.at(y) + (0.5 - west.least),
+            east: east.at(y) - (0.5 - east.least),
+            slopes: [west.slope, east.slope],
+        }
+    }
+
+    #[inline(always)]
+    fn next(&mut self) {
+        self.west += self.slopes[0];
+        self.east += self.slopes[1];
     }
 }
 
@@ -289,16 +348,6 @@ impl Sides {
         let is_east = next[1] <= last[1];
         let (middle, high) = if is_east { (next, last) } else { (last, next) };
         Self { low, middle, high, is_east }
-    }
-
-    fn spans(&self) -> Spans {
-        let Self { low, middle, high, is_east } = *self;
-        Spans {
-            all: Line::new(low, high),
-            by: [Line::new(low, middle), Line::new(middle, high)],
-            middle: middle[1],
-            is_east,
-        }
     }
 }
 
@@ -321,11 +370,11 @@ fn away<const GAPS: bool>(h: i32, plane: &Plane, at: f64) -> f64 {
 /// Takes the largest of `|h * doubled - (start + east * i)|` over a row into `worst`.
 #[inline(always)]
 fn run_short<const GAPS: bool>(row: &[i32], start: f64, plane: &Plane, worst: &mut f64) {
-    let mut i = 0.0;
+    let mut at = start;
     for h in row {
-        let distance = away::<GAPS>(*h, plane, start + plane.east * i);
+        let distance = away::<GAPS>(*h, plane, at);
         *worst = if distance > *worst { distance } else { *worst };
-        i += 1.0;
+        at += plane.east;
     }
 }
 

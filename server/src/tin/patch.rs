@@ -472,10 +472,13 @@ fn cut(
         half.untouched.reserve(told.untouched.len().min(live * 5 / 16));
     }
     for (number, t) in triangles {
-        let i = usize::from(t.iter().any(|v| is_above[*v as usize]));
+        let i = usize::from(t.map(|v| is_above[v as usize]).contains(&true));
         let (half, numbers) = (&mut halves[i], &mut numbers[i]);
-        half.errors.extend(told.errors.get(number));
-        half.triangles.push(t.map(|v| {
+        if let Some(error) = told.errors.get(number) {
+            half.errors.push(*error);
+        }
+        let mut named = [NONE; 3];
+        for (name, v) in named.iter_mut().zip(t) {
             let number = &mut numbers[v as usize];
             if *number == NONE {
                 *number = u32::try_from(half.vertices.len()).unwrap_or(NONE);
@@ -483,8 +486,9 @@ fn cut(
                 half.needs.extend(told.needs.get(v as usize));
                 half.untouched.extend(told.untouched.get(v as usize));
             }
-            *number
-        }));
+            *name = *number;
+        }
+        half.triangles.push(named);
     }
     (halves, numbers)
 }
