@@ -16,6 +16,10 @@
 //! it is at least how far their own samples will be, which says no to most before anything else is looked at. The
 //! farthest sample of each triangle is known from when it was allowed: nothing is measured twice.
 //!
+//! On the way to a count the source's own mesh is thinned first: every second vertex, of those with four neighbours, goes
+//! where the limit allows, all at once. And there what a vertex needs is not found out anew as often as one goes beside it: it
+//! is tried when the limit reaches what it needed at first.
+//!
 //! No other check of the topology is needed: triangles that turn left around a vertex which sees its whole rim
 //! cannot overlap others, and an edge that was there already would have had to cross them.
 
@@ -24,7 +28,7 @@ use super::ground::Ground;
 use super::mesh::{Mesh, NONE, Star, next, triangle};
 use super::metric::{Costs, between, length, turn};
 use super::square::{Role, Square};
-use super::state::{State, at_least, below, shortened, unshortened, vertex};
+use super::state::{Around, State, at_least, below, shortened, unshortened, vertex};
 use super::{Rules, Vertex};
 use std::collections::HashMap;
 
@@ -101,6 +105,8 @@ pub(super) struct Simplifier<'a> {
     needs: &'a [u16],
     is_source: bool,
     untouched: &'a [bool],
+    /// Whether a vertex beside one that has gone is taken to need what it did before, until it is tried.
+    needs_stay: bool,
     /// Of triangles of the star, if its centre goes the way that was looked at last.
     found: Vec<(usize, f32)>,
     star: Star,
@@ -133,6 +139,7 @@ impl<'a> Simplifier<'a> {
             needs: before.needs,
             is_source: before.is_source,
             untouched: before.untouched,
+            needs_stay: false,
             found: Vec::new(),
             star: Star::default(),
             fan: Fan::new(square.width()),
@@ -167,6 +174,7 @@ impl<'a> Simplifier<'a> {
     fn run_within(&mut self, triangles: usize, ground: Ground<'a>) {
         let start = f64::from(self.errors.iter().copied().fold(0.0, f32::max));
         self.target = self.halves().saturating_mul(triangles);
+        self.needs_stay = self.untouched.contains(&true);
         let heights = self.mesh.points.iter().map(|v| f64::from(v.height));
         let (low, high) = heights.fold((f64::MAX, f64::MIN), |(low, high), h| (low.min(h), high.max(h)));
         let mut vertical = start.max(LIMIT_LEAST);
@@ -178,6 +186,7 @@ impl<'a> Simplifier<'a> {
         let most = (start + high - low).max(width * per_metre);
         self.look_at_all();
         vertical = vertical.max(self.share_needs());
+        self.thin(vertical);
         loop {
             let border = if per_metre > 0.0 { vertical / per_metre } else { f64::INFINITY };
             self.until = Until::Error { ground, vertical, border };
@@ -228,6 +237,44 @@ impl<'a> Simplifier<'a> {
         if needs.is_empty() { 0.0 } else { f64::from(*needs.select_nth_unstable_by(place, f32::total_cmp).1) }
     }
 
+    /// Lets go at once what a limit allows of every second vertex of the source's mesh, those with four neighbours: no two
+    /// of them are neighbours, so none changes what another one needs, and nothing but its own sample lies in the two
+    /// triangles that one leaves. Each goes the way on which that sample is nearer.
+    fn thin(&mut self, limit: f64) {
+        let mut ranks = std::mem::take(&mut self.queue);
+        ranks.clear();
+        for v in 0..index(self.states.len()) {
+            let (state, at) = (&self.states[v as usize], self.mesh.points[v as usize]);
+            let is_one = state.role == Role::Free
+                && f64::from(state.needed) <= limit
+                && !(at.x + at.y).is_multiple_of(2)
+                && self.untouched.get(v as usize).is_some_and(|is| *is)
+                && !self.mesh.is_at_border(v);
+            if is_one {
+                ranks.push(State { key: state.needed, ..*state }.rank(v));
+            }
+        }
+        let most = self.mesh.live.saturating_sub(self.target) / 2;
+        if ranks.len() > most {
+            ranks.sort_unstable();
+            ranks.truncate(most);
+        }
+        for v in ranks.iter().map(|rank| vertex(*rank)) {
+            self.mesh.look(v, &mut self.star);
+            let height = |to: usize| self.mesh.points[self.star.rim()[to] as usize].height;
+            let at = self.mesh.points[v as usize].height;
+            let bends = [0, 1].map(|to| (height(to) + height(to + 2) - 2 * at).abs());
+            let to = usize::from(bends[1] < bends[0]);
+            let off = at_least(0.5 * f64::from(bends[to]));
+            self.found.clear();
+            for i in [to + 1, to + 2] {
+                self.found.push((triangle(self.star.spokes()[i % 4]), off));
+            }
+            self.collapse(to);
+        }
+        self.queue = ranks;
+    }
+
     /// Notes what the star's centre needs at least for its own sample, unless it lies at a border.
     fn bound(&mut self) {
         let v = self.star.centre;
@@ -236,7 +283,7 @@ impl<'a> Simplifier<'a> {
         }
         self.fan.look(&self.mesh, &self.star);
         let along = self.states[v as usize].role == Role::Along;
-        let (square, points, rim) = (&self.square, &self.mesh.points, &self.star.rim);
+        let (square, points, rim) = (&self.square, &self.mesh.points, &self.star.rim());
         let off = self.fan.least_off(|to| !along || square.is_along(points[rim[to] as usize]));
         self.states[v as usize].needed = below(off).max(0.0);
     }
@@ -277,7 +324,8 @@ impl<'a> Simplifier<'a> {
     /// with what the diamond becomes a part of.
     pub(super) fn known(&self) -> Vec<u16> {
         let known = |(v, state): (u32, &State)| {
-            let may = state.role == Role::Free && state.needed < f32::INFINITY;
+            let is_sure = state.needed < f32::INFINITY && state.around != Around::Thinned;
+            let may = state.role == Role::Free && is_sure;
             if may && !self.mesh.is_at_border(v) { shortened(state.needed) } else { 0 }
         };
         (0..).zip(&self.states).map(known).collect()
@@ -285,7 +333,7 @@ impl<'a> Simplifier<'a> {
 
     /// Which vertices have had nothing gone around them.
     pub(super) fn untouched(&self) -> Vec<bool> {
-        self.states.iter().map(|state| !state.is_touched).collect()
+        self.states.iter().map(|state| state.around == Around::Whole).collect()
     }
 
     /// Collapses what a limit allows, the least important first. What changes after it was tried is tried again in
@@ -315,7 +363,13 @@ impl<'a> Simplifier<'a> {
             let needed = self.find_ways(per_metre);
             match self.first_allowed(limit) {
                 Ok(to) => self.collapse(to),
-                Err(at_least) => self.states[v as usize].needed = below(needed.min(at_least)),
+                Err(at_least) => {
+                    let state = &mut self.states[v as usize];
+                    state.needed = below(needed.min(at_least));
+                    if state.around == Around::Thinned {
+                        state.around = Around::Changed;
+                    }
+                }
             }
         }
         self.queue = queue;
@@ -409,10 +463,10 @@ impl<'a> Simplifier<'a> {
         let mut limit = f64::INFINITY;
         if star.border {
             // The last triangle of all stays.
-            if star.spokes.len() == 1 && mesh.twin(next(star.spokes[0])) == NONE {
+            if star.spokes().len() == 1 && mesh.twin(next(star.spokes()[0])) == NONE {
                 return f64::INFINITY;
             }
-            let ends = [star.rim[0], star.rim[star.rim.len() - 1]];
+            let ends = [star.rim()[0], star.rim()[star.rim().len() - 1]];
             let [out, into] = ends.map(|v| mesh.points[v as usize]);
             // What is drawn must not grow, and a border that leaves the hypotenuse stays where it does.
             let leaves = along && !ends.iter().all(|v| self.is_along(*v));
@@ -435,13 +489,13 @@ impl<'a> Simplifier<'a> {
         self.fan.look(mesh, star);
         self.fan.measure();
         // Opposite ways out of four leave the same two triangles.
-        let ways = if star.rim.len() == 4 && !star.border && !along { 2 } else { star.rim.len() };
+        let ways = if star.rim().len() == 4 && !star.border && !along { 2 } else { star.rim().len() };
         for to in 0..ways {
-            let is_end = to == 0 || to + 1 == star.rim.len();
+            let is_end = to == 0 || to + 1 == star.rim().len();
             if star.border && !is_end {
                 continue;
             }
-            if along && !self.is_along(star.rim[to]) {
+            if along && !self.is_along(star.rim()[to]) {
                 continue;
             }
             let matters = |off| off <= limit || off < needed;
@@ -454,6 +508,7 @@ impl<'a> Simplifier<'a> {
         }
         // What a way costs matters beside others alone.
         if self.ways.len() > 1 {
+            self.fan.prepare(&self.rules.scale);
             for (cost, to) in &mut self.ways {
                 *cost = self.costs.cost(mesh, star, &self.fan, *to);
             }
@@ -473,10 +528,10 @@ impl<'a> Simplifier<'a> {
         self.found.clear();
         let Until::Error { ground, vertical, .. } = &self.until else { return 0.0 };
         let star = &self.star;
-        let u = star.rim[to];
+        let u = star.rim()[to];
         let point = |v: u32| self.mesh.points[v as usize];
         let mut most = 0.0f64;
-        for i in 0..star.spokes.len() {
+        for i in 0..star.spokes().len() {
             let [p, q] = star.edge(i);
             if p == u || q == u {
                 continue;
@@ -486,7 +541,7 @@ impl<'a> Simplifier<'a> {
             if most > *vertical {
                 break;
             }
-            self.found.push((triangle(star.spokes[i]), at_least(distance)));
+            self.found.push((triangle(star.spokes()[i]), at_least(distance)));
         }
         most
     }
@@ -495,8 +550,8 @@ impl<'a> Simplifier<'a> {
     fn border_distance(&self) -> f64 {
         let star = &self.star;
         let point = |v: u32| self.mesh.points[v as usize];
-        let ends = [point(star.rim[star.rim.len() - 1]), point(star.rim[0])];
-        let halves = star.incoming().into_iter().chain([star.spokes[0]]);
+        let ends = [point(star.rim()[star.rim().len() - 1]), point(star.rim()[0])];
+        let halves = star.incoming().into_iter().chain([star.spokes()[0]]);
         let passed = halves.filter_map(|h| self.passed.get(&h)).flatten().copied();
         let centre = point(star.centre);
         passed
@@ -512,7 +567,7 @@ impl<'a> Simplifier<'a> {
         let mut passed = Vec::new();
         if star.border {
             let (centre, out, into) =
-                (point(star.centre), point(star.rim[0]), point(star.rim[star.rim.len() - 1]));
+                (point(star.centre), point(star.rim()[0]), point(star.rim()[star.rim().len() - 1]));
             if let Some(before) = star.incoming().and_then(|h| self.passed.remove(&h)) {
                 passed = before;
             }
@@ -520,7 +575,7 @@ impl<'a> Simplifier<'a> {
             if turn(into, centre, out) != 0 {
                 passed.push([centre.x, centre.y]);
             }
-            passed.extend(self.passed.remove(&star.spokes[0]).unwrap_or_default());
+            passed.extend(self.passed.remove(&star.spokes()[0]).unwrap_or_default());
         }
         let moved = self.mesh.collapse(&star, to);
         if !self.passed.is_empty() {
@@ -540,11 +595,15 @@ impl<'a> Simplifier<'a> {
             }
         }
         self.states[star.centre as usize].needed = f32::INFINITY;
-        for v in &star.rim {
+        for v in star.rim() {
             let state = &mut self.states[*v as usize];
-            state.is_touched = true;
+            let stays = self.needs_stay && state.around != Around::Changed;
+            state.around = if stays { Around::Thinned } else { Around::Changed };
             if state.role != Role::Locked {
-                (state.needed, state.is_known) = (0.0, false);
+                state.is_known = false;
+                if !stays {
+                    state.needed = 0.0;
+                }
             }
         }
         self.star = star;

@@ -68,10 +68,11 @@ pub(super) struct Mesh {
 #[derive(Debug, Default)]
 pub(super) struct Star {
     pub(super) centre: u32,
-    /// Half-edges that leave the centre, counterclockwise: one a triangle.
-    pub(super) spokes: Vec<u32>,
-    /// The vertices around, counterclockwise: one a spoke, and one more at a border.
-    pub(super) rim: Vec<u32>,
+    /// Of stars before there may be more behind.
+    spokes: Vec<u32>,
+    rim: Vec<u32>,
+    /// How many spokes there are.
+    count: usize,
     pub(super) border: bool,
 }
 
@@ -92,14 +93,32 @@ impl Default for Moved {
 }
 
 impl Star {
+    /// Half-edges that leave the centre, counterclockwise: one a triangle.
+    pub(super) fn spokes(&self) -> &[u32] {
+        &self.spokes[..self.count]
+    }
+
+    #[cold]
+    fn grow(&mut self) {
+        let count = (2 * self.spokes.len()).max(16);
+        self.spokes.resize(count, NONE);
+        self.rim.resize(count, NONE);
+    }
+
+    /// The vertices around, counterclockwise: one a spoke, and one more at a border.
+    pub(super) fn rim(&self) -> &[u32] {
+        &self.rim[..self.count + usize::from(self.border)]
+    }
+
     /// The rim's edge opposite of the centre in triangle `i`.
     pub(super) fn edge(&self, i: usize) -> [u32; 2] {
-        [self.rim[i], self.rim[if i + 1 == self.rim.len() { 0 } else { i + 1 }]]
+        let rim = self.rim();
+        [rim[i], rim[if i + 1 == rim.len() { 0 } else { i + 1 }]]
     }
 
     /// The border's half-edge into the centre, if there is a border.
     pub(super) fn incoming(&self) -> Option<u32> {
-        self.spokes.last().filter(|_| self.border).map(|spoke| prev(*spoke))
+        self.spokes().last().filter(|_| self.border).map(|spoke| prev(*spoke))
     }
 }
 
@@ -200,28 +219,31 @@ impl Mesh {
 
     /// Looks around a vertex that is live.
     pub(super) fn look(&self, v: u32, star: &mut Star) {
-        star.spokes.clear();
-        star.rim.clear();
-        star.centre = v;
         let fours = self.halves.as_chunks::<STRIDE>().0;
         let start = self.first[v as usize];
-        let mut h = start;
+        let (mut h, mut count) = (start, 0);
+        star.centre = v;
         star.border = loop {
             let four = &fours[triangle(h)];
             // Of corner 0, 1 and 2 two bits each: the corners after and before.
             let twice = 2 * (h & 3);
             let (to, from) = (four[0b00_10_01 >> twice & 3], four[0b01_00_10 >> twice & 3]);
-            star.spokes.push(h);
-            star.rim.push(to.origin);
+            // Room for one more, for a border.
+            if count + 1 >= star.spokes.len().min(star.rim.len()) {
+                star.grow();
+            }
+            (star.spokes[count], star.rim[count]) = (h, to.origin);
+            count += 1;
             h = from.twin;
             if h == NONE {
-                star.rim.push(from.origin);
+                star.rim[count] = from.origin;
                 break true;
             }
             if h == start {
                 break false;
             }
         };
+        star.count = count;
     }
 
     fn link(&mut self, h: u32, twin: u32) {
@@ -264,25 +286,25 @@ impl Mesh {
     ///
     /// The star must not be all there is of a component: a triangle has to be left.
     pub(super) fn collapse(&mut self, star: &Star, to: usize) -> Moved {
-        let count = star.spokes.len();
-        let u = star.rim[to];
+        let count = star.spokes().len();
+        let u = star.rim()[to];
         let mut moved = Moved::default();
         if star.border && count == 1 {
-            let beyond = self.twin(next(star.spokes[0]));
-            self.remove(star.spokes[0]);
+            let beyond = self.twin(next(star.spokes()[0]));
+            self.remove(star.spokes()[0]);
             self.first[star.centre as usize] = NONE;
             self.halves[beyond as usize].twin = NONE;
             self.settle_around(beyond);
             self.settle_around(next(beyond));
             return Moved { joined: Some(beyond), ..moved };
         }
-        for spoke in &star.spokes {
+        for spoke in star.spokes() {
             self.halves[*spoke as usize].origin = u;
         }
         let mut touched = [NONE; 3];
         if !star.border || to == 0 {
             // The triangle left of the spoke vanishes: what was beyond it lies beyond the next spoke.
-            let (gone, after) = (star.spokes[to], star.spokes[(to + 1) % count]);
+            let (gone, after) = (star.spokes()[to], star.spokes()[(to + 1) % count]);
             let beyond = self.twin(next(gone));
             self.link(after, beyond);
             moved.rim[0] = [next(gone), after];
@@ -293,7 +315,7 @@ impl Mesh {
         }
         if !star.border || to > 0 {
             let (gone, before) =
-                (star.spokes[(to + count - 1) % count], star.spokes[(to + 2 * count - 2) % count]);
+                (star.spokes()[(to + count - 1) % count], star.spokes()[(to + 2 * count - 2) % count]);
             let side = prev(before);
             let beyond = self.twin(next(gone));
             self.link(side, beyond);
@@ -301,8 +323,8 @@ impl Mesh {
             self.remove(gone);
             touched[2] = side;
             if star.border {
-                touched[0] = star.spokes[0];
-                moved.joined = Some(star.spokes[0]);
+                touched[0] = star.spokes()[0];
+                moved.joined = Some(star.spokes()[0]);
             }
         }
         self.first[star.centre as usize] = NONE;

@@ -137,7 +137,7 @@ impl Costs {
     /// nothing is lost with it.
     pub(super) fn importance(&self, mesh: &Mesh, star: &Star) -> (f64, bool) {
         let (mut areas, mut sum) = (0.0, [0.0; 3]);
-        for spoke in &star.spokes {
+        for spoke in star.spokes() {
             let (vector, area) = self.vectors[triangle(*spoke)];
             areas += area;
             sum = [sum[0] + vector[0], sum[1] + vector[1], sum[2] + vector[2]];
@@ -154,7 +154,7 @@ impl Costs {
             return (varies + bend, flat);
         }
         // The least of what the ways out of here cost.
-        let ways = (0..star.rim.len()).filter(|to| !border || *to == 0 || *to + 1 == star.rim.len());
+        let ways = (0..star.rim().len()).filter(|to| !border || *to == 0 || *to + 1 == star.rim().len());
         (ways.map(|to| self.quadric(mesh, star, to)).fold(f64::INFINITY, f64::min), flat)
     }
 
@@ -163,7 +163,7 @@ impl Costs {
         if !self.quadrics.is_empty() {
             return self.quadric(mesh, star, to);
         }
-        let changes = fan.cost(&self.scale, to, |i| self.vectors[triangle(star.spokes[i])]);
+        let changes = fan.cost(&self.scale, to, |i| self.vectors[triangle(star.spokes()[i])]);
         if star.border {
             return changes + self.lambda * self.bend(mesh, star, usize::from(to > 0));
         }
@@ -173,7 +173,7 @@ impl Costs {
     /// The bend of the border where it is moved along its outgoing edge, or (1) its incoming one.
     fn bend(&self, mesh: &Mesh, star: &Star, way: usize) -> f64 {
         let point = |v: u32| mesh.points[v as usize];
-        let ends = [star.rim[0], star.rim[star.rim.len() - 1]];
+        let ends = [star.rim()[0], star.rim()[star.rim().len() - 1]];
         let centre = point(star.centre);
         let out = between(&self.scale, centre, point(ends[0]));
         let into = between(&self.scale, point(ends[1]), centre);
@@ -183,19 +183,19 @@ impl Costs {
     }
 
     fn quadric(&self, mesh: &Mesh, star: &Star, to: usize) -> f64 {
-        let u = star.rim[to] as usize;
+        let u = star.rim()[to] as usize;
         let at = between(&self.scale, self.origin, mesh.points[u]);
         (self.quadrics[star.centre as usize].at(at) + self.quadrics[u].at(at)).max(0.0)
     }
 
     /// Follows a collapse that has been done.
     pub(super) fn follow(&mut self, mesh: &Mesh, star: &Star, to: usize) {
-        let u = star.rim[to];
+        let u = star.rim()[to];
         if !self.quadrics.is_empty() {
             let gone = self.quadrics[star.centre as usize];
             self.quadrics[u as usize].add(&gone);
         }
-        for spoke in &star.spokes {
+        for spoke in star.spokes() {
             let t = triangle(*spoke);
             let corners = mesh.corners(t);
             if corners[0] != NONE {

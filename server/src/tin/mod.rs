@@ -20,6 +20,7 @@
 
 mod collapse;
 mod fan;
+mod few;
 mod ground;
 mod mesh;
 mod metric;

@@ -2,6 +2,17 @@
 
 use super::square::Role;
 
+/// What has happened around a vertex of the source's mesh.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Around {
+    /// Nothing has gone.
+    Whole,
+    /// Something has; what the vertex needs is still what it needed before.
+    Thinned,
+    /// Something has, and that has been seen.
+    Changed,
+}
+
 /// What is known of a vertex as long as nothing changes around it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct State {
@@ -14,14 +25,13 @@ pub(super) struct State {
     /// Whether both are known.
     pub(super) is_known: bool,
     pub(super) role: Role,
-    /// Whether anything around it has gone.
-    pub(super) is_touched: bool,
+    pub(super) around: Around,
 }
 
 impl State {
     /// Of a vertex that nothing is known of but where it lies.
     pub(super) fn new(role: Role) -> Self {
-        Self { key: 0.0, needed: 0.0, flat: false, is_known: false, role, is_touched: false }
+        Self { key: 0.0, needed: 0.0, flat: false, is_known: false, role, around: Around::Whole }
     }
 
     /// Numbers that sort as the keys do, none of which is negative, and of equal keys as the vertices: so that the order

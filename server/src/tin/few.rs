@@ -1,0 +1,154 @@
+//! A whole fan of few vertices nearby, as most are: two times four numbers, worked on side by side.
+//!
+//! Steps along x and y and their products are whole numbers below 2^24, so areas in plan are exact in `f32`. What heights
+//! have a part in is rounded: distances are made so much less that they are never more than the true ones.
+
+use super::Vertex;
+use super::metric::Vector;
+use glam::Vec4;
+
+/// Vertices around of most fans, at most.
+pub(super) const FEW: usize = 8;
+
+/// Cells that a mesh may be wide for all areas of its fans to be exact in `f32`: sums of three products of two steps
+/// are below 2^24.
+pub(super) const NEAR: u32 = (1 << 11) - 1;
+
+/// More than what rounding leaves of a sum of three products of which each has been rounded four times.
+const ROUNDING: f32 = 1.0 / (1u32 << 20) as f32;
+
+/// A number of each triangle: of those that follow the first four vertices, and the others.
+type Eight = [Vec4; 2];
+
+/// The vertices around the origin, in cells and quanta.
+#[derive(Debug, Default)]
+pub(super) struct Few {
+    count: usize,
+    /// The vertices, and those that follow them. Behind the last one comes the first one again and again.
+    here: [[f32; FEW]; 3],
+    after: [[f32; FEW]; 3],
+    /// How far the centre's own sample will be from the surface at least, by ways; infinite where there is no way.
+    offs: [f32; FEW],
+    /// Of the triangles that follow the vertices the edges, back to the vertices; twice the area vectors, in cells and
+    /// quanta; the normals; and the areas.
+    edges: [Eight; 3],
+    vectors: [Eight; 3],
+    normals: [Eight; 3],
+    areas: Eight,
+    metres: [f32; 3],
+}
+
+fn each<T>(of: impl Fn(usize) -> T) -> [T; 2] {
+    [of(0), of(1)]
+}
+
+fn eight(numbers: &[f32; FEW]) -> Eight {
+    let [a, b, c, d, e, f, g, h] = *numbers;
+    [Vec4::new(a, b, c, d), Vec4::new(e, f, g, h)]
+}
+
+fn length([a, b, c]: [Vec4; 3]) -> Vec4 {
+    (a * a + b * b + c * c).sqrt()
+}
+
+impl Few {
+    /// Takes over the vertices around a centre, [`FEW`] at most.
+    #[allow(clippy::cast_precision_loss, reason = "below 2^24, but for heights, whose rounding is counted")]
+    pub(super) fn look(&mut self, centre: Vertex, points: &[Vertex], rim: &[u32]) {
+        let step = |a: u32, b: u32| b.wrapping_sub(a).cast_signed() as f32;
+        let steps = |v: &u32| {
+            let v = &points[*v as usize];
+            [step(centre.x, v.x), step(centre.y, v.y), (v.height - centre.height) as f32]
+        };
+        let Some((first, rest)) = rim.split_first() else { return };
+        let first = steps(first);
+        self.count = rim.len();
+        (self.here, self.after) = (first.map(|w| [w; FEW]), first.map(|w| [w; FEW]));
+        for (i, v) in (1..FEW).zip(rest) {
+            for ((here, after), w) in self.here.iter_mut().zip(&mut self.after).zip(steps(v)) {
+                (here[i], after[i - 1]) = (w, w);
+            }
+        }
+    }
+
+    /// Finds out how far off the centre's own sample will be, whichever way it goes. Of each way all triangles are looked at
+    /// at once: whether one turns over, and which one will cover the sample.
+    pub(super) fn measure(&mut self) {
+        let [x, y, z] = self.here.each_ref().map(eight);
+        let [next_x, next_y, next_z] = self.after.each_ref().map(eight);
+        let turns = each(|i| x[i] * next_y[i] - y[i] * next_x[i]);
+        // Behind all there is no area, and neither have the two triangles at a way itself any left.
+        let behind = u32::MAX << self.count;
+        let mut without = 1 | 1 << (self.count - 1);
+        for to in 0..FEW.min(self.count) {
+            let [u_x, u_y, u_z] = [0, 1, 2].map(|k| Vec4::splat(self.here[k][to]));
+            let from = each(|i| u_x * y[i] - u_y * x[i]);
+            let until = each(|i| u_x * next_y[i] - u_y * next_x[i]);
+            let doubled = each(|i| turns[i] + from[i] - until[i]);
+            let remain = doubled.map(|doubled| doubled.cmpgt(Vec4::ZERO));
+            let [low, high] = remain.map(|remain| remain.bitmask());
+            if low | high << 4 | behind | without != u32::MAX {
+                self.offs[to] = f32::INFINITY;
+            } else {
+                let most = each(|i| {
+                    let (a, b, c) = (turns[i] * u_z, from[i] * next_z[i], until[i] * z[i]);
+                    let surely = (a + b - c).abs() - Vec4::splat(ROUNDING) * (a.abs() + b.abs() + c.abs());
+                    let covers = from[i].cmpge(Vec4::ZERO) & until[i].cmple(Vec4::ZERO) & remain[i];
+                    Vec4::select(covers, surely / doubled[i], Vec4::ZERO)
+                });
+                self.offs[to] = most[0].max(most[1]).max_element();
+            }
+            without = if to == 0 { 0b11 } else { without << 1 };
+        }
+    }
+
+    /// What [`Few::measure`] has found of a way.
+    pub(super) fn off(&self, to: usize) -> f64 {
+        self.offs[to % FEW].into()
+    }
+
+    /// Prepares [`Few::cost`], given what the components of cross products have to be scaled by to be area vectors.
+    #[allow(clippy::cast_possible_truncation, reason = "an order need not be precise")]
+    pub(super) fn prepare(&mut self, metres: Vector) {
+        self.metres = metres.map(|w| w as f32);
+        let [x, y, z] = self.here.each_ref().map(eight);
+        let [next_x, next_y, next_z] = self.after.each_ref().map(eight);
+        self.edges = [each(|i| x[i] - next_x[i]), each(|i| y[i] - next_y[i]), each(|i| z[i] - next_z[i])];
+        self.vectors = [
+            each(|i| y[i] * next_z[i] - z[i] * next_y[i]),
+            each(|i| z[i] * next_x[i] - x[i] * next_z[i]),
+            each(|i| x[i] * next_y[i] - y[i] * next_x[i]),
+        ];
+        for i in 0..2 {
+            let vector = [0, 1, 2].map(|k| self.vectors[k][i] * self.metres[k]);
+            let area = length(vector);
+            self.areas[i] = area;
+            for (normals, vector) in self.normals.iter_mut().zip(vector) {
+                normals[i] = vector / area;
+            }
+        }
+    }
+
+    /// How much the normals of the triangles that survive change if the centre slides into a vertex: where normals differ
+    /// by d, 1 - n . n' is d^2 / 2.
+    pub(super) fn cost(&self, to: usize) -> f64 {
+        let [u_x, u_y, u_z] = [0, 1, 2].map(|k| Vec4::splat(self.here[k][to % FEW]));
+        let [x, y, z] = &self.edges;
+        let of_four = each(|i| {
+            let [old_x, old_y, old_z] = [0, 1, 2].map(|k| self.vectors[k][i]);
+            let doubled = old_z + (u_x * y[i] - u_y * x[i]);
+            let vector = [
+                (old_x + (u_y * z[i] - u_z * y[i])) * self.metres[0],
+                (old_y + (u_z * x[i] - u_x * z[i])) * self.metres[1],
+                doubled * self.metres[2],
+            ];
+            let area = length(vector);
+            let d = [0, 1, 2].map(|k| vector[k] / area - self.normals[k][i]);
+            let change = (area + self.areas[i]) * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
+            Vec4::select(doubled.cmpgt(Vec4::ZERO), change, Vec4::ZERO)
+        });
+        // In an order of our own: the same on every machine.
+        let [a, b, c, d] = (of_four[0] + of_four[1]).to_array();
+        0.25 * f64::from((a + b) + (c + d))
+    }
+}
