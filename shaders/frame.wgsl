@@ -115,6 +115,12 @@ fn lit(albedo: vec3<f32>, normal: vec3<f32>) -> vec3<f32> {
     return albedo * (sun + sky);
 }
 
+// What the mirrored picture tells in alpha of how far away the things are that it shows: from 0.5 near by to 1, in steps of a
+// tenth; the sky has 0.
+fn told_distance(metres: f32) -> f32 {
+    return 0.5 + 0.5 * clamp((log2(metres) + 4.0) / 24.0, 0.0, 1.0);
+}
+
 // Linear light and sRGB, from 0 to 1.
 fn to_srgb(c: vec3<f32>) -> vec3<f32> {
     let curve = 1.055 * pow(c, vec3<f32>(1.0 / 2.4)) - 0.055;

@@ -99,14 +99,16 @@ fn terrain_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
     return terrain_colour(shaded);
 }
 
-// Seen in water: what is below its surface is not.
+// Seen in water: what is below its surface is not. Alpha tells how far away it is; of ground from below, which no light comes
+// from to where there is ground, that it is as near as can be.
 @fragment
 fn mirrored_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
     let colour = terrain_colour(shaded);
     if shaded.from_eye.z < frame.water.w {
         discard;
     }
-    return colour;
+    let is_below = dot(normal_of(shaded), shaded.from_eye) > 0.0;
+    return vec4<f32>(colour.rgb, select(told_distance(length(shaded.from_eye)), 0.5, is_below));
 }
 
 // The sides of triangles.

@@ -13,8 +13,8 @@ struct Water {
     // x: the part that is mirrored looking straight down. y: 1 / refractive index. z: metres of the near plane.
     // w: how bright the sun glitters.
     optics: vec4<f32>,
-    // Each wave: xy the wave vector, in radians a metre; z the phase at the eye; w the largest slope.
-    waves: array<vec4<f32>, 10>,
+    // Each wave: xy the wave vector, in radians a metre; z the phase at the eye; w how high it is, in metres above the mean.
+    waves: array<vec4<f32>, 24>,
 }
 
 // The variance of slopes, along an axis, of ripples smaller than the waves: near, and where waves are smaller than a pixel.
@@ -45,13 +45,15 @@ fn projected(p: vec3<f32>) -> vec3<f32> {
 fn wave_slope(across: vec2<f32>, right: vec2<f32>, down: vec2<f32>) -> vec3<f32> {
     var slope = vec3<f32>(0.0);
     var shortest = 0.0;
-    for (var i = 0; i < 10; i++) {
+    for (var i = 0; i < 24; i++) {
         let wave = water.waves[i];
         // Radians of the wave that a pixel covers: beyond pi its samples show another wave.
         let step = max(abs(dot(wave.xy, right)), abs(dot(wave.xy, down)));
         let seen = 1.0 - smoothstep(0.3, 1.2, step);
-        let along = wave.xy / length(wave.xy) * (wave.w * seen * cos(dot(wave.xy, across) + wave.z));
-        slope += vec3<f32>(along, 0.25 * wave.w * wave.w * (1.0 - seen * seen));
+        if seen > 0.0 {
+            slope += vec3<f32>(wave.xy * (wave.w * seen * cos(dot(wave.xy, across) + wave.z)), 0.0);
+        }
+        slope.z += 0.25 * wave.w * wave.w * dot(wave.xy, wave.xy) * (1.0 - seen * seen);
         shortest = max(shortest, 1.0 - seen);
     }
     return slope + vec3<f32>(0.0, 0.0, mix(RIPPLES.x, RIPPLES.y, shortest));
@@ -105,6 +107,47 @@ fn ray_through(place: vec2<f32>) -> vec3<f32> {
     return normalize(frame.forward.xyz + clip.x * frame.right.xyz + clip.y * frame.up.xyz);
 }
 
+// Metres ahead of the eye, and up from it, of what the scene without water shows at a place of the screen, or at its edge: both
+// a great many where that is the sky.
+fn scene_ahead(place: vec2<f32>) -> vec2<f32> {
+    let inside = clamp(place, vec2<f32>(0.0), vec2<f32>(1.0));
+    let clip = vec2<f32>(2.0, -2.0) * (inside - 0.5);
+    let ahead = water.optics.z / max(exact_depth(inside), 1e-20);
+    return ahead * vec2<f32>(1.0, frame.forward.z + clip.x * frame.right.z + clip.y * frame.up.z);
+}
+
+// The last place on the way from one place of the screen to another that is of use to a surface `level` metres above the eye and
+// `ahead` of it. What is below it is hidden by banks and by whatever is nearer than it; what it mirrors (`up`), by far banks alone,
+// as the mirrored picture shows what is behind them there, not their foot, which is clipped. A bank in one piece is found to a 32nd
+// of the way.
+fn last_place(here: vec2<f32>, there: vec2<f32>, level: f32, ahead: f32, up: bool) -> vec2<f32> {
+    var low = 0.0;
+    var high = 1.0;
+    var middle = 1.0;
+    for (var i = 0; i < 6; i++) {
+        let found = scene_ahead(mix(here, there, middle));
+        let is_near = found.x < ahead;
+        let is_bank = found.y > level && found.y < 1e9;
+        if select(is_near || is_bank, is_bank && !is_near, up) {
+            high = middle;
+        } else {
+            low = middle;
+        }
+        if low == 1.0 {
+            break;
+        }
+        middle = 0.5 * (low + high);
+    }
+    return mix(here, there, low);
+}
+
+// The part of the way from a place of the screen to another that is on it.
+fn way_on_screen(here: vec2<f32>, there: vec2<f32>) -> f32 {
+    let way = there - here;
+    let room = select(here, 1.0 - here, way > vec2<f32>(0.0)) / max(abs(way), vec2<f32>(1e-9));
+    return clamp(min(room.x, room.y), 0.0, 1.0);
+}
+
 // How far a place is outside of the screen, in parts of it.
 fn outside(place: vec2<f32>) -> f32 {
     let beyond = max(abs(place - 0.5) - 0.5, vec2<f32>(0.0));
@@ -115,12 +158,18 @@ fn outside(place: vec2<f32>) -> f32 {
 // slopes the picture is read, in deviations.
 const SOFTENING: f32 = 0.03;
 const TAP: f32 = 0.2;
+const TAPS: i32 = 12;
+// exp(-TAP * TAP / 2).
+const BELL: f32 = 0.9801987;
 
 // The mirrored picture at a place of the screen and above what it shows there, as facets see it whose slopes vary about those
 // of `normal` by `variance`. Facets that lean towards the eye move what they mirror by twice as much, upwards; those that lean
-// away are hidden, or mirror other waves, and those that lean aside hardly move it: a row of places is enough, which does not
-// go past a shore.
-fn blurred(image: vec3<f32>, ray: vec3<f32>, normal: vec3<f32>, variance: f32) -> vec4<f32> {
+// away are hidden, or mirror other waves, and those that lean aside hardly move it: a row of places is enough. Those that show
+// a bank on this side of the water, which is `distance` metres away, are passed over: where all do, what still water
+// mirrors takes their place, that at `here`.
+fn blurred(
+    here: vec2<f32>, image: vec3<f32>, ray: vec3<f32>, normal: vec3<f32>, variance: f32, distance: f32,
+) -> vec4<f32> {
     if water.optics.w == 0.0 || image.z == 0.0 {
         return textureSampleLevel(mirrored, smooth_sampler, image.xy, 0.0);
     }
@@ -130,13 +179,19 @@ fn blurred(image: vec3<f32>, ray: vec3<f32>, normal: vec3<f32>, variance: f32) -
     let moved = reflect(ray, leaning);
     let still = reflect(ray, normal);
     let step = projected(vec3<f32>(moved.xy, -moved.z) * 1e6).xy - projected(vec3<f32>(still.xy, -still.z) * 1e6).xy;
-    var sum = vec4<f32>(0.0);
-    var weights = 0.0;
-    for (var i = 0; i < 12; i++) {
-        let off = f32(i) * TAP;
-        let weight = exp(-0.5 * off * off);
-        sum += weight * textureSampleLevel(mirrored, smooth_sampler, image.xy + f32(i) * step, 0.0);
+    let near = told_distance(0.9 * distance);
+    var weights = 1e-3;
+    var sum = weights * textureSampleLevel(mirrored, smooth_sampler, here, 0.0);
+    // The bell curve, without its exponential: from one place to the next it falls by a factor that falls by a factor.
+    var bell = 1.0;
+    var fall = BELL;
+    for (var i = 0; i < TAPS; i++) {
+        let found = textureSampleLevel(mirrored, smooth_sampler, image.xy + f32(i) * step, 0.0);
+        let weight = select(bell, 0.0, found.a > 0.02 && found.a < near);
+        sum += weight * found;
         weights += weight;
+        bell *= fall;
+        fall *= BELL * BELL;
     }
     return sum / weights;
 }
@@ -166,13 +221,14 @@ fn water_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
     let down = max(abs(bent.z), 0.05);
     let bed = projected(p + bent * min(depth / down, 1e7));
     var place = here;
-    let other_ray = ray_through(bed.xy);
-    let other = scene_distance(bed.xy, dot(other_ray, frame.forward.xyz));
-    // What stands before the surface is not seen through it.
-    let other_depth = p.z - other_ray.z * other;
-    if !from_below && bed.z > 0.0 && outside(bed.xy) == 0.0 && other_depth > 0.0 && other > distance {
-        place = bed.xy;
-        depth = other_depth;
+    if !from_below && bed.z > 0.0 {
+        // What stands before the surface is not seen through it.
+        let end = mix(here, bed.xy, way_on_screen(here, bed.xy));
+        place = last_place(here, end, p.z, dot(p, frame.forward.xyz), false);
+        let other_ray = ray_through(place);
+        let other_depth = p.z - other_ray.z * scene_distance(place, dot(other_ray, frame.forward.xyz));
+        // Behind a crest above the eye there may be the sky alone.
+        depth = select(max(other_depth, 0.0), depth, other_ray.z > 0.0);
     }
     // Light comes down, and up to the eye; seen from below it is the way to the surface that counts.
     let way = select(depth * (1.0 + 1.0 / down), distance, from_below);
@@ -192,20 +248,15 @@ fn water_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
     // A wave's far side mirrors what a lower wave before it does: nearly the horizon.
     back = normalize(vec3<f32>(back.xy, abs(back.z)));
     var image = projected(vec3<f32>(back.xy, -back.z) * 1e6);
-    // Past a shore the mirrored picture shows what is behind the bank, whose foot is clipped: there the still surface's
-    // is nearer to the truth; the more so the higher the bank, without an edge.
-    let inside = clamp(image.xy, vec2<f32>(0.0), vec2<f32>(1.0));
-    let beyond = ray_through(inside);
-    let bank = beyond.z * scene_distance(inside, dot(beyond, frame.forward.xyz));
-    if image.z > 0.0 && bank < 1e9 {
-        image = vec3<f32>(mix(image.xy, here, smoothstep(0.0, 0.02, (bank - p.z) / distance)), 1.0);
+    if image.z > 0.0 {
+        image = vec3<f32>(last_place(here, image.xy, p.z, dot(p, frame.forward.xyz), true), 1.0);
     }
-    let found = blurred(image, ray, normal, slope.z);
-    // Past the edges nothing was drawn.
-    let lost = select(1.0, smoothstep(0.0, 0.1, outside(image.xy)), image.z > 0.0);
+    let found = blurred(here, image, ray, normal, slope.z, distance);
+    // Past the edges nothing was drawn: for as far as waves reach, the picture is taken to go on there as it came.
+    let lost = select(1.0, smoothstep(0.1, 0.3, outside(image.xy)), image.z > 0.0);
     // Still water mirrors the sun's disc, where alpha says that there is sky; waves break it into the glitter below.
     let angle = 2.0 * length(frame.up.xyz) / f32(textureDimensions(scene).y);
-    let is_open = 1.0 - mix(found.a, 0.0, lost);
+    let is_open = 1.0 - mix(min(2.0 * found.a, 1.0), 0.0, lost);
     let disc = sun_towards(back, angle) * (is_open * (1.0 - water.optics.w));
     let above = mix(found.rgb, sky_towards(back), lost) + disc;
     let glitter = water.optics.w * SUNLIGHT * glitter_of(ray, normal, slope.z);

@@ -24,7 +24,7 @@ use std::collections::BTreeMap;
 const FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8UnormSrgb;
 
 /// Waves that are added up; the twin of a number in `shaders/water.wgsl`.
-const WAVES: usize = 10;
+const WAVES: usize = 24;
 
 /// Metres a second each second.
 const GRAVITY: f64 = 9.81;
@@ -72,19 +72,20 @@ impl WaterUniform {
 }
 
 /// Waves from the longest in metres on down, about a wind from the north-west. Phases are told at the eye, so that they are
-/// exact however far it is from the origin.
+/// exact however far it is from the origin. Of those that a pixel shows, wherever the water is seen from, several are nearly as long
+/// as the longest: two or three of them would be a pattern, as of woven cloth.
 fn waves(longest: f64, strength: f64, seconds: f64, eye: DVec2) -> [[f32; 4]; WAVES] {
     std::array::from_fn(|i| {
         let part = i as f64;
-        let turn = std::f64::consts::TAU / (longest * 0.68f64.powf(part));
+        let turn = std::f64::consts::TAU / (longest * 0.86f64.powf(part));
         // Spread as evenly as may be without repeating: by the golden ratio.
         let spread = ((part + 1.0) * 0.618_034).fract() * 2.0 - 1.0;
         let direction = DVec2::from_angle(-0.8 + 1.3 * spread);
-        // Deep water: the square of the speed grows with the length.
-        let phase = turn * direction.dot(eye) - (GRAVITY * turn).sqrt() * seconds + 1.7 * part;
+        // Deep water: the square of the speed grows with the length. At the origin no two are in step, nor in a row.
+        let phase = turn * direction.dot(eye) - (GRAVITY * turn).sqrt() * seconds + 1.7 * part * part;
         let vector = direction * turn;
-        let slope = 0.012 * strength;
-        [single(vector.x), single(vector.y), single(phase.rem_euclid(std::f64::consts::TAU)), single(slope)]
+        let height = 0.0077 * strength / turn;
+        [single(vector.x), single(vector.y), single(phase.rem_euclid(std::f64::consts::TAU)), single(height)]
     })
 }
 
@@ -258,6 +259,9 @@ impl WaterPasses {
                 label: Some("water"),
                 mag_filter: filter,
                 min_filter: filter,
+                // Waves read a little beyond the edges.
+                address_mode_u: wgpu::AddressMode::MirrorRepeat,
+                address_mode_v: wgpu::AddressMode::MirrorRepeat,
                 ..Default::default()
             })
         };
