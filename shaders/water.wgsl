@@ -8,7 +8,7 @@
 struct Water {
     // rgb: what a metre of water takes away of light, as the exponent. w: metres of depth over which the shore fades in.
     absorption: vec4<f32>,
-    // rgb: what deep water sends back of white light.
+    // rgb: what deep water sends back of white light. w: metres around where ground ends in which a coast is drawn smooth.
     body: vec4<f32>,
     // x: the part that is mirrored looking straight down. y: 1 / refractive index. z: metres of the near plane.
     // w: how bright the sun glitters.
@@ -157,10 +157,10 @@ fn outside(place: vec2<f32>) -> f32 {
 // Ripples too small to be seen make the mirrored picture soft: what of their variance does so, and how far apart in their
 // slopes the picture is read, in deviations.
 const SOFTENING: f32 = 0.03;
-const TAP: f32 = 0.2;
-const TAPS: i32 = 12;
+const TAP: f32 = 0.24;
+const TAPS: i32 = 10;
 // exp(-TAP * TAP / 2).
-const BELL: f32 = 0.9801987;
+const BELL: f32 = 0.9716106;
 
 // The mirrored picture at a place of the screen and above what it shows there, as facets see it whose slopes vary about those
 // of `normal` by `variance`. Facets that lean towards the eye move what they mirror by twice as much, upwards; those that lean
@@ -180,8 +180,8 @@ fn blurred(
     let still = reflect(ray, normal);
     let step = projected(vec3<f32>(moved.xy, -moved.z) * 1e6).xy - projected(vec3<f32>(still.xy, -still.z) * 1e6).xy;
     let near = told_distance(0.9 * distance);
-    var weights = 1e-3;
-    var sum = weights * textureSampleLevel(mirrored, smooth_sampler, here, 0.0);
+    var weights = 0.0;
+    var sum = vec4<f32>(0.0);
     // The bell curve, without its exponential: from one place to the next it falls by a factor that falls by a factor.
     var bell = 1.0;
     var fall = BELL;
@@ -193,7 +193,61 @@ fn blurred(
         bell *= fall;
         fall *= BELL * BELL;
     }
+    if weights < 0.1 {
+        let rest = 0.1 - weights;
+        sum += rest * textureSampleLevel(mirrored, smooth_sampler, here, 0.0);
+        weights += rest;
+    }
     return sum / weights;
+}
+
+// The pixels over which a coast is drawn smooth: where it is less there is nothing to smooth, and where it is more the few places
+// that are read show one by one.
+const COAST_PIXELS: vec2<f32> = vec2<f32>(1.0, 40.0);
+const COAST_TAPS: i32 = 16;
+
+// Ground around a place of water whose bed is unknown: its colour, its depth below the water in metres, and how much
+// of all that is around it is ground, 0 to 1.
+struct Coast {
+    colour: vec3<f32>,
+    depth: f32,
+    share: f32,
+}
+
+fn coast_at(here: vec2<f32>, p: vec3<f32>) -> Coast {
+    let reach = water.body.w;
+    let east = projected(p + vec3<f32>(reach, 0.0, 0.0)).xy - here;
+    let north = projected(p + vec3<f32>(0.0, reach, 0.0)).xy - here;
+    let size = vec2<f32>(textureDimensions(scene));
+    let across = (abs(east) + abs(north)) * size;
+    let pixels = max(across.x, across.y);
+    if pixels < COAST_PIXELS.x || pixels > COAST_PIXELS.y {
+        return Coast(vec3<f32>(0.0), 0.0, 0.0);
+    }
+    let ahead = dot(p, frame.forward.xyz);
+    var colour = vec3<f32>(0.0);
+    var depth = 0.0;
+    var ground = 0.0;
+    var all = 0.0;
+    var turn = vec2<f32>(1.0, 0.0);
+    for (var i = 0; i < COAST_TAPS; i++) {
+        // Spread evenly over a disc, by the golden angle.
+        turn = vec2<f32>(-0.737369 * turn.x - 0.675490 * turn.y, 0.675490 * turn.x - 0.737369 * turn.y);
+        let far = sqrt((f32(i) + 0.5) / f32(COAST_TAPS));
+        // The middle of a pixel, where no colour of the sky beside it is mixed in.
+        let place = (floor((here + far * (turn.x * east + turn.y * north)) * size) + 0.5) / size;
+        let weight = 1.0 - 0.5 * far;
+        let found = scene_ahead(place);
+        // What is before or behind all that is around is none of it.
+        if max(abs(found.x - ahead), abs(found.y - p.z)) < 3.0 * reach {
+            colour += weight * textureSampleLevel(scene, smooth_sampler, place, 0.0).rgb;
+            depth += weight * max(p.z - found.y, 0.0);
+            ground += weight;
+        }
+        all += weight;
+    }
+    let fade = 1.0 - smoothstep(0.5 * COAST_PIXELS.y, COAST_PIXELS.y, pixels);
+    return Coast(colour / max(ground, 1e-6), depth / max(ground, 1e-6), fade * ground / all);
 }
 
 @fragment
@@ -215,7 +269,7 @@ fn water_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
     let facing = max(-dot(ray, normal), 0.0);
 
     // Through the surface. The bed's depth below it is that along the ray not bent, then that at the place it bends to.
-    let straight = scene_distance(here, ahead);
+    let straight = water.optics.z / max(exact_depth(here), 1e-20) / ahead;
     var depth = max(straight - distance, 0.0) * abs(ray.z);
     let bent = select(refract(ray, normal, water.optics.y), ray, from_below);
     let down = max(abs(bent.z), 0.05);
@@ -230,10 +284,19 @@ fn water_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
         // Behind a crest above the eye there may be the sky alone.
         depth = select(max(other_depth, 0.0), depth, other_ray.z > 0.0);
     }
+    var seen = textureSampleLevel(scene, smooth_sampler, place, 0.0).rgb;
+    if depth > 1e6 && !from_below {
+        // Along a coast without a bed it is taken to go down from the ground, whose outline would have the corners of its samples.
+        let coast = coast_at(here, p);
+        let away = clamp(1.0 - 2.0 * coast.share, 0.0, 1.0);
+        if coast.share > 0.0 {
+            seen = coast.colour;
+            depth = coast.depth + 3.0 * away * away / water.absorption.g;
+        }
+    }
     // Light comes down, and up to the eye; seen from below it is the way to the surface that counts.
     let way = select(depth * (1.0 + 1.0 / down), distance, from_below);
     let left = exp(-water.absorption.rgb * way);
-    let seen = textureSampleLevel(scene, smooth_sampler, place, 0.0).rgb;
     let body = lit(water.body.rgb, vec3<f32>(0.0, 0.0, 1.0));
     let through = mix(body, seen, left);
     if from_below {

@@ -16,7 +16,7 @@ use super::{DEPTH, Draw, FrameStats, Lens, Look, Renderer, clear_colour, is_wate
 use crate::camera::Camera;
 use crate::drawing::DrawItem;
 use crate::mirror::mean_height;
-use diamantina_protocol::message::Layer;
+use diamantina_protocol::message::{Kind, Layer};
 use glam::{DVec2, DVec3};
 use std::collections::BTreeMap;
 
@@ -46,8 +46,8 @@ pub(super) struct WaterUniform {
 }
 
 impl WaterUniform {
-    /// `near`: the near plane of the picture of what is seen through, in metres.
-    fn new(layer: &Layer, look: &Look, eye: DVec3, near: f32) -> Self {
+    /// Of a layer of water among `layers`. `near`: the near plane of the picture of what is seen through, in metres.
+    fn new(layers: &[Layer], layer: &Layer, look: &Look, eye: DVec3, near: f32) -> Self {
         let water = &look.water;
         let extent = [0, 1].map(|i| layer.cell[i] * f64::from(layer.samples[i]));
         let extent = extent[0].hypot(extent[1]);
@@ -57,9 +57,12 @@ impl WaterUniform {
         let index = water.refractive_index;
         let straight_down = ((index - 1.0) / (index + 1.0)).powi(2);
         let longest = (extent / 100.0).clamp(0.02, 60.0);
+        // As far as an outline of the coarsest samples jumps.
+        let cells = layers.iter().filter(|layer| layer.kind == Kind::Terrain).flat_map(|layer| layer.cell);
+        let coast = cells.fold(0.0, f64::max);
         Self {
             absorption: [r, g, b, single(clarity * look.exaggeration / 50.0)],
-            body: [BODY[0], BODY[1], BODY[2], 0.0],
+            body: [BODY[0], BODY[1], BODY[2], single(coast)],
             optics: [
                 single(straight_down),
                 single(1.0 / index),
@@ -345,7 +348,7 @@ impl WaterPasses {
                 self.mirrors.insert(number, mirror);
             }
             let Some(mirror) = self.mirrors.get_mut(&number) else { continue };
-            let uniform = WaterUniform::new(layer, look, camera.eye, near);
+            let uniform = WaterUniform::new(layers, layer, look, camera.eye, near);
             renderer.queue.write_buffer(&mirror.uniform, 0, bytemuck::bytes_of(&uniform));
             let told = renderer.mirrors.iter().find(|mirror| mirror.layer == number);
             let drawn = draws.iter().map(|draw| (draw.item.diamond, draw.bounds));

@@ -238,3 +238,56 @@ fn an_even_bed_has_no_contours() {
         assert!(most <= 3, "{most}: {:?}", (140..290).map(green).collect::<Vec<_>>());
     }
 }
+
+/// Behind a low island waves mirrored the island itself, from below: dark patches along its far shore.
+#[test]
+fn waves_mirror_no_bank_on_this_side_of_the_water() {
+    let shore = Shore::new(0.0, |_, y| if (8..=12).contains(&y) { 20 } else { -400 });
+    let camera = Camera {
+        eye: shore.land.place(0.5, 0.02, 14.0),
+        target: shore.land.place(0.5, 0.6, 0.0),
+        fov_y: FOV_Y,
+        size: [300, 200],
+    };
+    // Grey land in water that mirrors magenta, and nothing else, where the land ends: no light comes from below.
+    let look = Look {
+        water: Water { refractive_index: 1e12, waves: 1.0, clarity: Some(1e-3), ..CALM },
+        sun: Sun { azimuth_degrees: 180.0, altitude_degrees: 60.0 },
+        colours: Colours::Flat,
+        ..PLAIN
+    };
+    let picture = shore.picture(&camera, &shore.items, &look, 1);
+    let dry = shore.picture(&camera, &shore.land_items(), &look, 1);
+    let row = |north: f64| pixel_of(&camera, shore.land.place(0.5, north, 0.0))[1] as u32;
+    let (first, last) = (row(0.9), row(13.5 / 64.0));
+    assert!(first + 20 < last, "rows {first} to {last}");
+    let water = (first..last).flat_map(|y| (0..300).map(move |x| [x, y]));
+    let water: Vec<_> = water.filter(|p| dry.pixel(*p) != picture.pixel(*p)).collect();
+    let patches = water.iter().filter(|p| picture.pixel(**p).unwrap()[1] > 40).count();
+    assert!(water.len() > 1000 && patches == 0, "{patches} of {} pixels", water.len());
+}
+
+/// A coast whose ground ends where its samples do had their corners.
+#[test]
+fn a_coast_without_a_bed_has_no_corners() {
+    // Every other sample along the coast is missing one step farther out.
+    let shore = Shore::new(0.0, |x, y| if y >= 32 + x % 2 { 10 } else { NODATA });
+    let camera = Camera {
+        eye: shore.land.place(0.5, 0.5, 500.0),
+        target: shore.land.place(0.5, 0.5001, 0.0),
+        fov_y: FOV_Y,
+        size: [400, 300],
+    };
+    let look = Look { water: CALM, colours: Colours::Flat, ..PLAIN };
+    let plain = Look { water: Water { reflecting: false, ..CALM }, ..look };
+    let [smooth, cornered] = [look, plain].map(|look| {
+        let picture = shore.picture(&camera, &shore.items, &look, 1);
+        let land = picture.pixel([200, 100]).unwrap()[0];
+        // How far down the ground's colour goes, in each column.
+        let ends: Vec<u32> = (120..280)
+            .map(|x| (100..200).find(|y| picture.pixel([x, *y]).unwrap()[0].abs_diff(land) > 25).unwrap())
+            .collect();
+        ends.iter().max().unwrap() - ends.iter().min().unwrap()
+    });
+    assert!(cornered >= 4 && 3 * smooth < 2 * cornered, "{smooth} of {cornered} pixels");
+}
