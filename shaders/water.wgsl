@@ -45,15 +45,24 @@ fn projected(p: vec3<f32>) -> vec3<f32> {
 fn wave_slope(across: vec2<f32>, right: vec2<f32>, down: vec2<f32>) -> vec3<f32> {
     var slope = vec3<f32>(0.0);
     var shortest = 0.0;
+    // Whichever way a wave goes, a pixel covers at least so many metres of it.
+    let least = abs(right.x * down.y - right.y * down.x) / max(length(right) + length(down), 1e-20);
     for (var i = 0; i < 24; i++) {
         let wave = water.waves[i];
+        let steepness = wave.w * wave.w * dot(wave.xy, wave.xy);
+        if dot(wave.xy, wave.xy) * least * least >= 1.44 {
+            // Those that follow are shorter, and as steep.
+            slope.z += f32(24 - i) * 0.25 * steepness;
+            shortest = 1.0;
+            break;
+        }
         // Radians of the wave that a pixel covers: beyond pi its samples show another wave.
         let step = max(abs(dot(wave.xy, right)), abs(dot(wave.xy, down)));
         let seen = 1.0 - smoothstep(0.3, 1.2, step);
         if seen > 0.0 {
             slope += vec3<f32>(wave.xy * (wave.w * seen * cos(dot(wave.xy, across) + wave.z)), 0.0);
         }
-        slope.z += 0.25 * wave.w * wave.w * dot(wave.xy, wave.xy) * (1.0 - seen * seen);
+        slope.z += 0.25 * steepness * (1.0 - seen * seen);
         shortest = max(shortest, 1.0 - seen);
     }
     return slope + vec3<f32>(0.0, 0.0, mix(RIPPLES.x, RIPPLES.y, shortest));
@@ -230,7 +239,11 @@ fn coast_at(here: vec2<f32>, p: vec3<f32>) -> Coast {
     var ground = 0.0;
     var all = 0.0;
     var turn = vec2<f32>(1.0, 0.0);
-    for (var i = 0; i < COAST_TAPS; i++) {
+    for (var i = COAST_TAPS - 1; i >= 0; i--) {
+        // From the rim on in: out at sea the first few, in all directions, find no ground.
+        if i == COAST_TAPS - 6 && ground == 0.0 {
+            break;
+        }
         // Spread evenly over a disc, by the golden angle.
         turn = vec2<f32>(-0.737369 * turn.x - 0.675490 * turn.y, 0.675490 * turn.x - 0.737369 * turn.y);
         let far = sqrt((f32(i) + 0.5) / f32(COAST_TAPS));
