@@ -28,7 +28,7 @@ fn main() {
     let ground = Ground::new(&field, None).expect("no mask to be wrong");
     let mut group = bench.benchmark_group("selection");
     group.throughput(Throughput::Elements(field.samples() as u64)).sample_size(10);
-    for percent in [0.0, 0.1, 0.3, 0.5, 1.0, 3.0, 7.0] {
+    for percent in [0.0, 0.1, 0.3, 0.4, 0.5, 1.0, 3.0, 7.0] {
         let tolerance = percent / 100.0 * field.relief();
         group.bench_function(format!("top_down_{percent}_percent"), |b| {
             b.iter(|| top_down(&ground, Criterion::Vertical, black_box(tolerance), 0.0));
