@@ -9,7 +9,7 @@
 //!   points that a single descent finds.
 //! - [`greedy`]: the worst triangle first, until all are good or a number of points is reached.
 //! - [`prune`]: takes points out again, finest first, as long as every triangle that changes stays within
-//!   the tolerance. What remains is needed, but for a point in thousands.
+//!   the tolerance. It goes over them three times.
 //!
 //! After the bitree paper, its section 3.2. Every selection is measured anew afterwards, over all samples.
 
