@@ -1,11 +1,11 @@
-# Each target does its own set-up (scripts/setup says what it installs). Steps run one after another, but those of
-# `after-tests`, some of which leave most cores idle.
+# Each target does its own set-up (scripts/setup says what it installs). Steps run one after another, but for some of
+# `test`, which leave cores idle.
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 ifndef SIDE_BY_SIDE
 .NOTPARALLEL:
 endif
-.PHONY: help demo test test-long check after-tests contract objects bench bench-flight bench-link bench-peers bench-serve bench-users bench-wasm setup fmt clippy tests doc deny wasm web web-quick web-test scripts
+.PHONY: help demo test test-long check after-tests contract objects bench bench-flight bench-link bench-peers bench-serve bench-users bench-wasm setup fmt clippy tests timed doc deny wasm web web-quick web-test scripts
 
 # Mesa's device selection complains where there is no desktop session; there is nothing to select.
 export NODEVICE_SELECT := 1
@@ -33,11 +33,12 @@ demo:
 	@$(step) build cargo build --locked --release -p diamantina-server -p diamantina-client
 	$(target)/release/diamantina-server demo
 
-test: setup fmt clippy tests
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target SIDE_BY_SIDE=yes after-tests
-	@$(step) web-test scripts/web-test
+test: setup fmt clippy
+	@$(MAKE) --no-print-directory --jobs=2 SIDE_BY_SIDE=yes tests web-quick
+	@$(MAKE) --no-print-directory timed
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target SIDE_BY_SIDE=yes web-test after-tests
 
-after-tests: web-quick contract objects doc deny wasm scripts
+after-tests: contract objects doc deny wasm scripts
 
 check: fmt clippy
 
@@ -85,6 +86,8 @@ clippy:
 # timeouts, so there are two for each core; those that are held against the clock come afterwards, one by one.
 tests:
 	@$(step) tests cargo test --locked --workspace --no-fail-fast -- --show-output --test-threads=$$((2 * $$(nproc))) --skip timed::
+
+timed:
 	@$(step) timed cargo test --locked --workspace --test e2e -- --show-output --test-threads=1 timed::
 
 # What takes too long for each change. Each DEM is told as it is done.
@@ -111,9 +114,12 @@ web:
 	@$(step) setup scripts/setup web
 	@$(step) web scripts/web
 
-# What web-test builds, where it can be built.
+# What web-test builds, where it can be built, with what others leave of the processors. It says what it has to say once
+# it is done.
 web-quick:
-	@$(step) web-quick scripts/web-test --build
+	@mkdir -p $(target)
+	@status=0; nice -n 19 $(step) web-quick scripts/web-test --build > $(target)/web-quick.log 2>&1 || status=$$?; \
+	    cat $(target)/web-quick.log; exit $$status
 
 web-test: setup
 	@$(step) web-test scripts/web-test
