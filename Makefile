@@ -1,5 +1,5 @@
 # Each target does its own set-up (scripts/setup says what it installs). Steps run one after another, but for some of
-# `test`, which leave cores idle.
+# `test`.
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 ifndef SIDE_BY_SIDE
