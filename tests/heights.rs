@@ -3,6 +3,7 @@
 use crate::world::{Dice, build, options, serve, write_raw};
 use diamantina_protocol::message::{HeightAnswer, Layer};
 use diamantina_protocol::points::Rule;
+use diamantina_server::height::Decoded;
 use diamantina_server::store::Store;
 use diamantina_server::{height, hierarchy};
 use rayon::prelude::*;
@@ -21,6 +22,7 @@ fn hills(x: u32, y: u32) -> Option<f32> {
 
 /// A DEM of `size` samples and what to ask of it.
 struct Asked<'a> {
+    decoded: &'a Decoded,
     store: &'a Store,
     layer: &'a Layer,
     size: [u32; 2],
@@ -30,7 +32,7 @@ impl Asked<'_> {
     /// The answer at a place in cells from the south-west sample.
     fn at(&self, cells: [f64; 2]) -> HeightAnswer {
         let place = [0, 1].map(|axis| self.layer.origin[axis] + self.layer.cell[axis] * cells[axis]);
-        height::height(self.store, 0, self.layer, None, place)
+        height::height(self.decoded, self.store, 0, self.layer, None, place)
             .unwrap_or_else(|e| panic!("{:?} samples, at {cells:?}: {e}", self.size))
     }
 
@@ -107,8 +109,12 @@ fn every_sample_and_every_edge_of_small_dems_is_within_the_declared_error() {
             // A place of its own whose coordinates are rounded, as in most real files.
             let mut layer = store.scene().layers[0].clone();
             (layer.origin, layer.cell) = ([432_100.1, 5_123_456.7], [30.1, 92.766_243]);
-            let asked = Asked { store: &store, layer: &layer, size };
-            (0..size[0] * size[1]).into_par_iter().for_each(|i| asked.around(i % size[0], i / size[0]));
+            // Diamonds that are kept, all and few of them, and now and then decoded for one answer alone.
+            let kept = [1 << 30, 100_000, 0].map(Decoded::new);
+            (0..size[0] * size[1]).into_par_iter().for_each(|i| {
+                let decoded = &kept[if i % 23 == 0 { 2 } else { usize::from(i % 7 == 0) }];
+                Asked { decoded, store: &store, layer: &layer, size }.around(i % size[0], i / size[0]);
+            });
         }
     }
 }

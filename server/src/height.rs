@@ -9,12 +9,47 @@
 
 use crate::inspect::{InspectError, read_page};
 use crate::projection::Projection;
-use crate::store::{Key, Kind, Store, StoreError};
+use crate::store::{Key, Kind, Store, StoreError, number};
+use bytes::Bytes;
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::{Block, Diamond};
 use diamantina_protocol::message::{Crs, HeightAnswer, Layer};
 use diamantina_protocol::points::{self, DecodeError};
+use quick_cache::sync::{Cache, DefaultLifecycle};
+use quick_cache::{DefaultHashBuilder, OptionsBuilder, Weighter};
 use std::collections::HashMap;
+use std::sync::Arc;
+
+/// Decoded diamonds of those that were asked about of late, for all who ask: places near one another, a profile's
+/// for example, then cost one decoding. Bounded in bytes; keys tell versions of scenes apart.
+#[derive(Debug)]
+pub struct Decoded(Option<Cache<Name, Arc<Block>, ByBytes>>);
+
+/// A diamond of a layer of a version of a scene; a version is a hash of all its content.
+type Name = (u64, u8, Diamond);
+
+#[derive(Debug, Clone)]
+struct ByBytes;
+
+impl Weighter<Name, Arc<Block>> for ByBytes {
+    fn weight(&self, _: &Name, block: &Arc<Block>) -> u64 {
+        // Beside the heights, a key, a place among the others and an allocation.
+        size_of_val(block.heights()) as u64 + 128
+    }
+}
+
+impl Decoded {
+    /// Keeps diamonds of at most `budget` bytes; 0 keeps none. One of 64 segments takes 33 kB.
+    #[must_use]
+    pub fn new(budget: u64) -> Self {
+        // One part: diamonds larger than a part's budget are not kept. The number is a hint for the first allocation.
+        let options =
+            OptionsBuilder::new().weight_capacity(budget).estimated_items_capacity(512).shards(1).clone();
+        Self(options.build().ok().filter(|_| budget > 0).map(|options| {
+            Cache::with_options(options, ByBytes, DefaultHashBuilder::default(), DefaultLifecycle::default())
+        }))
+    }
+}
 
 /// Why a height cannot be told.
 #[derive(Debug, thiserror::Error)]
@@ -81,11 +116,12 @@ pub fn to_frame(crs: Option<&Crs>, lon: f64, lat: f64) -> Result<[f64; 2], Heigh
 }
 
 /// The height of a layer at frame coordinates `[x, y]`, on the finest surface: the plane of the bintree
-/// triangle there. Decodes some tens of diamonds: milliseconds.
+/// triangle there. Decodes some tens of diamonds, milliseconds, unless they are among the `decoded`.
 ///
 /// # Errors
 /// When the place is outside of the layer or the store is damaged.
 pub fn height(
+    decoded: &Decoded,
     store: &Store,
     number: u8,
     layer: &Layer,
@@ -117,7 +153,7 @@ pub fn height(
     let centroid = [0, 1].map(|axis| corners.iter().map(|(c, _)| f64::from(c[axis])).sum::<f64>() / 3.0);
     let mut height = Some(0.0);
     if let Some(d) = finest(layer, centroid) {
-        let block = decode(store, number, layer, d, &mut HashMap::new())?;
+        let block = Decoder { decoded, store, number, layer, done: HashMap::new() }.decode(d)?;
         let local = layer.forest.local(d);
         for (corner, weight) in corners {
             let [p, q] = local.local2(corner.map(i64::from));
@@ -186,36 +222,55 @@ fn finest(layer: &Layer, place: [f64; 2]) -> Option<Diamond> {
     }
 }
 
-/// Decodes a diamond with its ancestors.
-fn decode(
-    store: &Store,
+/// Decodes diamonds for one answer.
+struct Decoder<'a> {
+    decoded: &'a Decoded,
+    store: &'a Store,
     number: u8,
-    layer: &Layer,
-    d: Diamond,
-    done: &mut HashMap<Diamond, Block>,
-) -> Result<Block, HeightError> {
-    if let Some(block) = done.get(&d) {
-        return Ok(block.clone());
+    layer: &'a Layer,
+    /// What this answer needed so far, however little is kept for others.
+    done: HashMap<Diamond, Arc<Block>>,
+}
+
+impl Decoder<'_> {
+    /// Decodes a diamond with its ancestors.
+    fn decode(&mut self, d: Diamond) -> Result<Arc<Block>, HeightError> {
+        if let Some(block) = self.done.get(&d) {
+            return Ok(Arc::clone(block));
+        }
+        let name = (number(&self.store.scene().version), self.number, d);
+        if let Some(block) = self.decoded.0.as_ref().and_then(|kept| kept.get(&name)) {
+            return Ok(block);
+        }
+        let forest = &self.layer.forest;
+        let mut block = Block::empty(forest, d.level());
+        for parent in forest.parents(d) {
+            block.inherit(forest, d, parent, &*self.decode(parent)?);
+        }
+        points::decode(forest, &self.layer.coding, d, &mut block, &self.payload(d)?)?;
+        let block = Arc::new(block);
+        self.done.insert(d, Arc::clone(&block));
+        if let Some(kept) = &self.decoded.0 {
+            kept.insert(name, Arc::clone(&block));
+        }
+        Ok(block)
     }
-    let mut block = Block::empty(&layer.forest, d.level());
-    for parent in layer.forest.parents(d) {
-        let from = decode(store, number, layer, parent, done)?;
-        block.inherit(&layer.forest, d, parent, &from);
-    }
-    let [a, b] = d.centre();
-    let payload = store.get(Key { layer: number, kind: Kind::Points, a, b })?;
-    if payload.is_none() {
-        // No payload is right only where the index says so.
-        let page = diamantina_protocol::index::page_of(&layer.forest, d);
-        let entries = read_page(store, number, layer, Kind::Index, page).map_err(|e| match e {
-            InspectError::Store(error) => HeightError::Store(error),
-            other => HeightError::Damaged(other.to_string()),
-        })?;
+
+    /// The payload of a diamond, which is empty where the index says so.
+    fn payload(&self, d: Diamond) -> Result<Bytes, HeightError> {
+        let [a, b] = d.centre();
+        if let Some(payload) = self.store.get(Key { layer: self.number, kind: Kind::Points, a, b })? {
+            return Ok(payload);
+        }
+        let page = diamantina_protocol::index::page_of(&self.layer.forest, d);
+        let entries =
+            read_page(self.store, self.number, self.layer, Kind::Index, page).map_err(|e| match e {
+                InspectError::Store(error) => HeightError::Store(error),
+                other => HeightError::Damaged(other.to_string()),
+            })?;
         if entries.iter().any(|(other, e)| *other == d && e.bytes > 0) {
             return Err(HeightError::Damaged(format!("the points of diamond {:?} are missing", [a, b])));
         }
+        Ok(Bytes::new())
     }
-    points::decode(&layer.forest, &layer.coding, d, &mut block, &payload.unwrap_or_default())?;
-    done.insert(d, block.clone());
-    Ok(block)
 }

@@ -38,6 +38,7 @@ pub use limits::Limits;
 pub use tls::TlsError;
 pub use viewer::ViewerError;
 
+use crate::height::Decoded;
 use crate::store::{Disk, Shared, Store, StoreError};
 use access::{Access, Caller};
 use blobs::Blobs;
@@ -126,6 +127,7 @@ impl Options {
 struct Site {
     scenes: Scenes,
     blobs: Arc<Blobs>,
+    decoded: Arc<Decoded>,
     access: Access,
     viewer: Option<Viewer>,
     metrics: Arc<Metrics>,
@@ -228,8 +230,9 @@ impl Server {
             sendfile::outlive_limits()?;
             let files = if self.tls.is_none() { Files::new() } else { None };
             let blobs = Arc::new(Blobs::new(self.limits.cache, files, Arc::clone(&metrics)));
+            let decoded = Arc::new(Decoded::new(self.limits.cache / 16));
             let (scenes, access, viewer) = (self.scenes, self.access, self.viewer);
-            let site = Arc::new(Site { scenes, blobs, access, viewer, metrics });
+            let site = Arc::new(Site { scenes, blobs, decoded, access, viewer, metrics });
             let front = Arc::new(Front::new(Arc::clone(&site), &self.limits));
             tokio::spawn(watch(site, Arc::clone(&front), self.tls.clone(), self.limits));
             accept::serve(listener, front, self.tls, self.limits, stop).await;

@@ -168,7 +168,14 @@ fn camera(store: &Store, view: View, above: f64, size: [u32; 2]) -> Result<Camer
     }
     let [low, high] = headless::extent(scene);
     let middle = low.midpoint(high);
-    let found = height::height(store, 0, &scene.layers[0], scene.frame.crs.as_ref(), [middle.x, middle.y])?;
+    let found = height::height(
+        &height::Decoded::new(0),
+        store,
+        0,
+        &scene.layers[0],
+        scene.frame.crs.as_ref(),
+        [middle.x, middle.y],
+    )?;
     // Where there is nothing, the middle of all heights will do.
     let eye = middle.with_z(found.height.unwrap_or(middle.z) + above);
     let down = 10f64.to_radians();

@@ -498,7 +498,7 @@ async fn height_at(
 ) -> Result<Response, Refusal> {
     let store = find_scene(&site, caller, &name)?;
     points(find_layer(&store, &layer)?.1)?;
-    let blobs = Arc::clone(&site.blobs);
+    let (blobs, decoded) = (Arc::clone(&site.blobs), Arc::clone(&site.decoded));
     let number = |key: &str| -> Result<Option<f64>, Refusal> {
         let Some(text) = query.get(key) else { return Ok(None) };
         let value = text.parse::<f64>().ok().filter(|v| v.is_finite());
@@ -518,7 +518,7 @@ async fn height_at(
             }
         };
         let (number, layer) = find_layer(&store, &layer)?;
-        height::height(&store, number, layer, crs, place).map_err(|error| {
+        height::height(&decoded, &store, number, layer, crs, place).map_err(|error| {
             if let HeightError::Store(error) = &error {
                 blobs.failed(error);
             }
