@@ -637,6 +637,22 @@ impl Counts {
         }
     }
 
+    /// What all numbers counted cost, in bits, with the tables that fit them best. Corrections are left out.
+    #[must_use]
+    pub fn bits(&self) -> f64 {
+        let of = |part: u64, whole: u64| part as f64 * libm::log2(whole.max(1) as f64 / part.max(1) as f64);
+        let of_class = |(class, hazards): (usize, &[(u64, u64); HAZARDS])| {
+            let hazards_bits: f64 = hazards
+                .iter()
+                .map(|(stopped, reached)| of(*stopped, *reached) + of(reached - stopped, *reached))
+                .sum();
+            // Signs, and low bits that are sent plainly.
+            let (zeros, numbers) = hazards[0];
+            hazards_bits + (numbers - zeros) as f64 + (numbers * u64::from(class_shift(class))) as f64
+        };
+        self.numbers.iter().enumerate().map(of_class).sum()
+    }
+
     /// The model with these kernels whose hazards fit the counts, where there are enough of them.
     #[must_use]
     pub fn model(&self, levels: Vec<[Kernel; 2]>, refiners: Vec<[Refiner; REFINER_PASSES]>) -> Model {

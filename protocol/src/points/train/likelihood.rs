@@ -15,7 +15,8 @@ use super::fit::Fit;
 /// How many numbers are looked at for one set of weights: with more of them the weights hardly change.
 pub(super) const SEEN: usize = 6_000;
 const STEPS: usize = 10;
-/// As many samples as the first weights count for.
+/// As many of the numbers that say something as the first weights count for. With all numbers instead, of ground
+/// that is nearly flat the few that are not zero decide alone: then stores of it grew by up to a sixth.
 const PRIOR_SAMPLES: f64 = 20.0;
 /// Steps end where a number becomes cheaper by less than this, in nats.
 const GAIN_LEAST: f64 = 1e-5;
@@ -51,7 +52,8 @@ impl<const N: usize> Likelihood<N> {
         }
         let (mut weights, mut damping) = (start, 1e-3);
         let (mut best, mut fit) = self.cost(&weights);
-        let pulls = fit.diagonal().map(|square| square * PRIOR_SAMPLES / all);
+        let prior = PRIOR_SAMPLES / self.telling(&weights);
+        let pulls = fit.diagonal().map(|square| square * prior);
         for _ in 0..STEPS {
             let Some(step) = fit.clone().solve_damped(damping) else { break };
             let tried = std::array::from_fn(|i| weights[i] - step[i]);
@@ -73,6 +75,22 @@ impl<const N: usize> Likelihood<N> {
             }
         }
         weights
+    }
+
+    /// How many numbers say something of where their places are: the square of the sum of what they say, by the sum of
+    /// its squares.
+    fn telling(&self, weights: &[f64; N]) -> f64 {
+        let (mut sum, mut squares) = (0.0, 0.0);
+        for Seen { parts, interval, weight } in &self.seen {
+            let place = product(&weights[..self.places], &parts[..self.places]);
+            let spread = product(&weights[self.places..], &parts[self.places..]).max(SPREAD_LEAST);
+            let own = Share::of(*interval, place, spread).gradient[0];
+            let all = self.possible.map_or(0.0, |possible| Share::of(possible, place, spread).gradient[0]);
+            let told = (all - own).powi(2);
+            sum += weight * told;
+            squares += weight * told * told;
+        }
+        (sum * sum / squares.max(1e-300)).max(1.0)
     }
 
     /// What all numbers cost, in nats, and its first and second derivatives.

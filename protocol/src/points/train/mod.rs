@@ -26,7 +26,7 @@ mod sampler;
 use super::Rounder;
 use super::coding::Coding;
 use super::model::{Counts, Kernel, Model, REFINER_PASSES, Refiner};
-use super::walk::{Known, walk_new, walk_old};
+use super::walk::{Known, walk_new, walk_old, way};
 use crate::bintree::Forest;
 use crate::diamond::{Block, Diamond};
 use corrections::learn_refiners;
@@ -76,15 +76,40 @@ pub fn train<E>(
             before.extend(here.into_iter().map(|(d, block, _)| (d, block)));
             continue;
         }
-        kernels[level as usize] = learn_kernels(forest, coding, level, &here);
-        let learnt = coding.clone().with_model(Model::of_weights(kernels.clone(), refiners.clone()));
-        for (d, mut block, source) in here {
-            let mut pass = Rounder { source: source.heights(), counts: Some(&mut counts) };
-            let _ = walk_new(&learnt, level, &forest.local(d), &mut block, Known::Sent, &mut pass);
-            before.insert(d, block);
+        let mut best: [Option<Tried>; 2] = [None, None];
+        for candidate in learn_kernels(forest, coding, level, &here) {
+            kernels[level as usize] = candidate;
+            let learnt = coding.clone().with_model(Model::of_weights(kernels.clone(), refiners.clone()));
+            let mut tried =
+                candidate.map(|kernel| Tried { kernel, counts: Counts::default(), blocks: Vec::new() });
+            for (d, block, source) in &here {
+                let (local, mut block) = (forest.local(*d), block.clone());
+                let tried = &mut tried[way(&local)];
+                let mut pass = Rounder { source: source.heights(), counts: Some(&mut tried.counts) };
+                let _ = walk_new(&learnt, level, &local, &mut block, Known::Sent, &mut pass);
+                tried.blocks.push((*d, block));
+            }
+            for (best, tried) in best.iter_mut().zip(tried) {
+                if best.as_ref().is_none_or(|best| tried.counts.bits() < best.counts.bits()) {
+                    *best = Some(tried);
+                }
+            }
+        }
+        for (kernel, best) in kernels[level as usize].iter_mut().zip(best) {
+            let Some(best) = best else { continue };
+            *kernel = best.kernel;
+            counts.merge(&best.counts);
+            before.extend(best.blocks);
         }
     }
     Ok(counts.model(kernels, refiners))
+}
+
+/// A kernel, the numbers of the sampled diamonds coded by it, and these diamonds as a receiver has them.
+struct Tried {
+    kernel: Kernel,
+    counts: Counts,
+    blocks: Vec<(Diamond, Block)>,
 }
 
 /// Diamonds with all their ancestors, by level.
