@@ -23,7 +23,8 @@ pub struct Limits {
     /// Requests that may come at once where there is a --rate
     #[arg(long, default_value_t = 200, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub burst: u32,
-    /// The most memory for blobs that are asked for often; 0: none are kept
+    /// The most memory for blobs that are asked for often, and a sixteenth of it more for decoded diamonds whose heights
+    /// are; 0: none are kept
     #[arg(long, default_value = "256MiB", value_name = "BYTES", value_parser = parse_bytes)]
     pub cache: u64,
     /// Seconds between the signal to stop, from which on /ready says no, and the end of accepting connections: for

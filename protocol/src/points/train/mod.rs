@@ -4,7 +4,8 @@
 //! missing at earlier new points; and the activity, which is to be the mean magnitude of a difference. Every
 //! sample is weighed by how rough its neighbourhood is, since a difference twice as large costs one bit more
 //! wherever it occurs. From there to the weights under which the numbers sent are likeliest ([`likelihood`]).
-//! Numbers are counted by class along the way.
+//! New points of all samples are coded by both, and each level takes the one by which they cost less; their
+//! numbers are counted by class along the way.
 //!
 //! Level by level: a sampled diamond's ancestors are coded first, with what has been learnt of their
 //! levels, so a level is learnt from the very heights that a receiver will have. (Rounded source heights
@@ -37,8 +38,8 @@ use std::collections::{BTreeMap, BTreeSet};
 /// these say little it stays near the default. `coding` gives the rule and the steps; `source` the heights
 /// of a diamond's whole block.
 ///
-/// Takes some five microseconds for each new point of the diamonds and their ancestors, of which there are
-/// up to four a level and sample; and the memory of two levels of them.
+/// Takes about a microsecond for each new point of the diamonds and their ancestors, of which there are up to
+/// four a level and sample; and the memory of two levels of them, the finer one twice.
 ///
 /// # Errors
 /// When `source` does.
