@@ -94,6 +94,8 @@ impl Asked<'_> {
 fn every_sample_and_every_edge_of_small_dems_is_within_the_declared_error() {
     let folder = tempfile::tempdir().unwrap();
     let (dem, store) = (folder.path().join("dem.raw"), folder.path().join("store"));
+    // Diamonds that are kept, all and few of them, of all stores together; now and then one is decoded for one answer alone.
+    let kept = [1 << 30, 100_000, 0].map(Decoded::new);
     // Of one root and of several, full and ragged, thin.
     let sizes = [([65, 65], 5), ([97, 65], 5), ([40, 49], 5), ([140, 40], 5), ([260, 3], 6), ([129, 129], 6)];
     for (size, patch_log2) in sizes {
@@ -109,8 +111,6 @@ fn every_sample_and_every_edge_of_small_dems_is_within_the_declared_error() {
             // A place of its own whose coordinates are rounded, as in most real files.
             let mut layer = store.scene().layers[0].clone();
             (layer.origin, layer.cell) = ([432_100.1, 5_123_456.7], [30.1, 92.766_243]);
-            // Diamonds that are kept, all and few of them, and now and then decoded for one answer alone.
-            let kept = [1 << 30, 100_000, 0].map(Decoded::new);
             (0..size[0] * size[1]).into_par_iter().for_each(|i| {
                 let decoded = &kept[if i % 23 == 0 { 2 } else { usize::from(i % 7 == 0) }];
                 Asked { decoded, store: &store, layer: &layer, size }.around(i % size[0], i / size[0]);

@@ -127,7 +127,7 @@ async function heights(page, reference, blank, graphics) {
     await page.mouse.move(...GROUND);
     for (let i = 0; i < 4; i++) await page.mouse.wheel(0, -120);
     const nearer = await settled(page);
-    await page.waitForFunction(() => location.hash === `#${window.diamantina.state().view}`, null, { timeout: PATIENCE });
+    await page.waitForFunction(() => location.hash === `#${window.diamantina.state().view}`);
     check(nearer.view !== first.view, 'the wheel does not move the eye');
     const link = page.url();
     check(link.includes('scene=hills') && link.includes(query), `the address is ${link}`);
@@ -148,8 +148,7 @@ async function heights(page, reference, blank, graphics) {
 
     // Who changes the address is flown there.
     await page.evaluate((there) => { location.hash = there; }, hash(VIEW));
-    await page.waitForFunction(() => window.diamantina.state().view.startsWith('2500.00,500.00,2600.00,25.000,32.000'),
-        null, { timeout: PATIENCE });
+    await page.waitForFunction(() => window.diamantina.state().view.startsWith('2500.00,500.00,2600.00,25.000,32.000'));
 
     // The panel's first slider: more error, fewer triangles.
     const { triangles } = await state(page);
@@ -162,10 +161,17 @@ async function heights(page, reference, blank, graphics) {
     await page.mouse.up();
     await page.waitForFunction(
         (before) => window.diamantina.state().asked_error_pixels > 20 && window.diamantina.state().triangles < before,
-        triangles, { timeout: PATIENCE });
+        triangles);
 
     const last = await state(page);
     return `${mean.toFixed(2)} from the client's picture, longest frame ${last.longest_frame_milliseconds.toFixed(0)} ms`;
+}
+
+/// A context that waits for pages, too, as long as for all else.
+async function patient(browser, options) {
+    const context = await browser.newContext(options);
+    context.setDefaultTimeout(PATIENCE);
+    return context;
 }
 
 /// Opens the page on what `query` asks for, and takes a picture without the panel once nothing changes any more.
@@ -214,7 +220,7 @@ async function imagery(page, blank, graphics) {
 
 /// Fingers on a screen that has no mouse: what one takes hold of stays under it, two apart go nearer, a tap asks for the height.
 async function touch(browser, graphics) {
-    const context = await browser.newContext({ viewport: SIZE, deviceScaleFactor: 1, hasTouch: true });
+    const context = await patient(browser, { viewport: SIZE, deviceScaleFactor: 1, hasTouch: true });
     const page = await context.newPage();
     const devices = await context.newCDPSession(page);
     const finger = async (type, ...points) => {
@@ -232,7 +238,7 @@ async function touch(browser, graphics) {
             const { marks } = window.diamantina.state();
             const last = marks.at(-1)?.[0];
             return last && (last[0] !== u || last[1] !== v) && last;
-        }, known, { timeout: PATIENCE });
+        }, known);
         known = await place.jsonValue();
         return known;
     };
@@ -282,25 +288,25 @@ async function touch(browser, graphics) {
 async function choice(page) {
     await page.goto(`${url}/`);
     const links = page.locator('#message a');
-    await links.first().waitFor({ timeout: PATIENCE });
+    await links.first().waitFor();
     const names = await links.allTextContents();
     check(names.toSorted().join() === 'hills,lake,photo', `to choose from: ${names}`);
     await links.first().click();
-    await page.waitForFunction(() => window.diamantina?.state().frames > 0, null, { timeout: PATIENCE });
+    await page.waitForFunction(() => window.diamantina?.state().frames > 0);
     check((await state(page)).scene === 'hills', 'another scene was chosen');
     await page.goto(`${url}/?scene=nowhere`);
-    await page.locator('#message.failed').waitFor({ timeout: PATIENCE });
+    await page.locator('#message.failed').waitFor();
 }
 
 /// A private scene, which is not there without its token.
 async function secret(page) {
     await page.goto(`${url}/?scene=plain`);
     for (const given of ['wrong', token]) {
-        await page.locator('#message input').fill(given, { timeout: PATIENCE });
+        await page.locator('#message input').fill(given);
         await page.locator('#message').screenshot({ path: join(folder, 'token.png') });
         await Promise.all([page.waitForEvent('load'), page.locator('#message button').click()]);
     }
-    await page.waitForFunction(() => window.diamantina?.state().scene === 'plain', null, { timeout: PATIENCE });
+    await page.waitForFunction(() => window.diamantina?.state().scene === 'plain');
     check(!page.url().includes(token), 'the token is in the address');
 }
 
@@ -312,7 +318,7 @@ for (const graphics of ['webgpu', 'webgl']) {
     const args = [...COMMON, ...FLAGS[graphics]];
     const browser = await chromium.launch({ executablePath, headless: true, args });
     try {
-        const context = await browser.newContext({ viewport: SIZE, deviceScaleFactor: 1 });
+        const context = await patient(browser, { viewport: SIZE, deviceScaleFactor: 1 });
         const [page, blank] = [await context.newPage(), await context.newPage()];
         const wrong = [];
         let allowed = null;

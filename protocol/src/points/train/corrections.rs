@@ -5,7 +5,7 @@ use super::super::coding::Coding;
 use super::super::corrections::Parts;
 use super::super::model::{REFINER_PASSES, Refiner, SPREAD_PARTS, TILT_PARTS, Tables};
 use super::super::walk::walk_old;
-use super::fit::{Fit, fixed};
+use super::fit::{Fit, fixed, inverse_square};
 use super::likelihood::{Likelihood, MEAN_TO_SPREAD, SEEN, Seen, product};
 use super::sampler::Sampler;
 use crate::NODATA;
@@ -27,7 +27,7 @@ pub(super) fn learn_refiners(
     let known = Refiner::default();
     let (tilt, spread) = (known.tilt().map(f64::from), known.spread().map(f64::from));
     correct(forest, coding, level, diamonds, |correction| {
-        let weight = correction.expected(&spread).powi(-2);
+        let weight = inverse_square(correction.expected(&spread));
         tilts[correction.pass].add(&correction.tilt, correction.own, weight);
     });
     let tilts = tilts.map(|fit| fit.solve(&tilt));
@@ -43,7 +43,7 @@ pub(super) fn learn_refiners(
         let mut fit = Fit::new();
         for (correction, weight) in &sample {
             let missing = (correction.own - product(&tilt, &correction.tilt)).abs();
-            fit.add(&correction.spread, missing, weight * correction.expected(&spread).powi(-2));
+            fit.add(&correction.spread, missing, weight * inverse_square(correction.expected(&spread)));
         }
         let start = join(tilt, fit.solve(&spread).map(|w| w / MEAN_TO_SPREAD));
         let seen = sample.into_iter().map(|(correction, weight)| correction.seen(weight)).collect();

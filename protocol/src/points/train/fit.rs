@@ -35,7 +35,7 @@ impl<const N: usize> Fit<N> {
         self.right[unknown] += product;
     }
 
-    /// The solution, drawn towards `prior` as strongly as a hundred samples would.
+    /// The solution, drawn towards `prior` as strongly as a hundred of what was added would.
     pub(super) fn solve(mut self, prior: &[f64; N]) -> [f64; N] {
         const PRIOR_SAMPLES: f64 = 100.0;
         if self.count == 0.0 {
@@ -85,4 +85,9 @@ impl<const N: usize> Fit<N> {
 /// A weight as a whole number of 1/scale.
 pub(super) fn fixed(weight: f64, scale: f64) -> i16 {
     (weight * scale).round().clamp(f64::from(i16::MIN), f64::from(i16::MAX)) as i16
+}
+
+/// The weight of what is expected to be so far off. (`powi` may differ from platform to platform.)
+pub(super) fn inverse_square(expected: f64) -> f64 {
+    1.0 / (expected * expected)
 }

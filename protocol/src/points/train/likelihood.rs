@@ -20,6 +20,8 @@ const STEPS: usize = 10;
 const PRIOR_SAMPLES: f64 = 20.0;
 /// Steps end where a number becomes cheaper by less than this, in nats.
 const GAIN_LEAST: f64 = 1e-5;
+/// Below, a logistic distribution is the exponential of its argument to a double's last digit.
+const TAIL: f64 = -40.0;
 /// The smallest spread, in steps of the numbers.
 const SPREAD_LEAST: f64 = 0.04;
 /// How many times a logistic distribution's spread the mean distance from its middle is: 2 ln 2.
@@ -54,6 +56,7 @@ impl<const N: usize> Likelihood<N> {
         let (mut best, mut fit) = self.cost(&weights);
         let prior = PRIOR_SAMPLES / self.telling(&weights);
         let pulls = fit.diagonal().map(|square| square * prior);
+        pulls.iter().enumerate().for_each(|(i, pull)| fit.pull(i, *pull, 0.0));
         for _ in 0..STEPS {
             let Some(step) = fit.clone().solve_damped(damping) else { break };
             let tried = std::array::from_fn(|i| weights[i] - step[i]);
@@ -86,7 +89,7 @@ impl<const N: usize> Likelihood<N> {
             let spread = product(&weights[self.places..], &parts[self.places..]).max(SPREAD_LEAST);
             let own = Share::of(*interval, place, spread).gradient[0];
             let all = self.possible.map_or(0.0, |possible| Share::of(possible, place, spread).gradient[0]);
-            let told = (all - own).powi(2);
+            let told = (all - own) * (all - own);
             sum += weight * told;
             squares += weight * told * told;
         }
@@ -140,18 +143,20 @@ impl Share {
         if is_mirrored {
             ends = [-ends[1], -ends[0]];
         }
-        let [below, above] = ends.map(logistic);
-        let share = (above.0 - below.0).max(1e-300);
-        let by_place = (below.1 - above.1) / (spread * share);
-        let by_spread = (below.1 * ends[0] - above.1 * ends[1]) / (spread * share);
-        Self { log: libm::log(share), gradient: [if is_mirrored { -by_place } else { by_place }, by_spread] }
+        let [below, above] = ends;
+        // The logarithm, and the densities at both ends by the share.
+        let (log, densities) = if above < TAIL {
+            // The distribution is the exponential there.
+            let part = -libm::expm1(below - above);
+            (above + libm::log(part), [(1.0 - part) / part, 1.0 / part])
+        } else {
+            let [f, g] = [below, above].map(|z| 1.0 / (1.0 + libm::exp(-z)));
+            (libm::log(g - f), [f * (1.0 - f), g * (1.0 - g)].map(|density| density / (g - f)))
+        };
+        let by_place = (densities[0] - densities[1]) / spread;
+        let by_spread = (densities[0] * below - densities[1] * above) / spread;
+        Self { log, gradient: [if is_mirrored { -by_place } else { by_place }, by_spread] }
     }
-}
-
-/// The distribution's value and density.
-fn logistic(z: f64) -> (f64, f64) {
-    let f = 1.0 / (1.0 + libm::exp(-z.clamp(-600.0, 600.0)));
-    (f, f * (1.0 - f))
 }
 
 #[cfg(test)]
@@ -195,8 +200,8 @@ mod tests {
     #[test]
     fn gradients_are_what_small_changes_make() {
         const H: f64 = 1e-6;
-        for interval in [[-0.5, 0.5], [2.5, 3.5], [-9.5, -8.5], [-1.5, 1.5]] {
-            for (place, spread) in [(0.0, 1.0), (0.7, 0.3), (-1.2, 2.0)] {
+        for interval in [[-0.5, 0.5], [2.5, 3.5], [-9.5, -8.5], [-1.5, 1.5], [998.5, 999.5]] {
+            for (place, spread) in [(0.0, 1.0), (0.7, 0.3), (-1.2, 2.0), (70.0, 0.1)] {
                 let share = Share::of(interval, place, spread);
                 let by = |dp: f64, ds: f64| Share::of(interval, place + dp, spread + ds).log;
                 let changes = [by(H, 0.0) - by(-H, 0.0), by(0.0, H) - by(0.0, -H)].map(|d| d / (2.0 * H));

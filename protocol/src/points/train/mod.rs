@@ -39,7 +39,7 @@ use std::collections::{BTreeMap, BTreeSet};
 /// of a diamond's whole block.
 ///
 /// Takes about a microsecond for each new point of the diamonds and their ancestors, of which there are up to
-/// four a level and sample; and the memory of two levels of them, the finer one twice.
+/// four a level and sample; and four times the memory of the blocks of one level of them.
 ///
 /// # Errors
 /// When `source` does.

@@ -4,7 +4,7 @@ use super::super::coding::{Coding, Place, Rule};
 use super::super::model::{CAUSAL_BITS, Kernel, PAIRS};
 use super::super::rows::Ground;
 use super::super::walk::way;
-use super::fit::{Fit, fixed};
+use super::fit::{Fit, fixed, inverse_square};
 use super::likelihood::{Likelihood, MEAN_TO_SPREAD, SEEN, Seen, product};
 use super::sampler::Sampler;
 use crate::NODATA;
@@ -181,7 +181,7 @@ fn learn_pairs(fields: &[Field], kernel: &mut Kernel) {
     let mut fit = Fit::new();
     for field in fields {
         field.cells(|_, _, cell| {
-            let weight = field.expected(kernel, &cell).powi(-2);
+            let weight = inverse_square(field.expected(kernel, &cell));
             fit.add(&cell.pairs, cell.height - cell.mean, weight);
         });
     }
@@ -195,7 +195,7 @@ fn learn_causal(fields: &[Field], kernel: &mut Kernel) {
         field.cells_around(Rule::Smooth, kernel, |cell, around| {
             if let [Some(s), Some(sw), Some(se), Some(w)] = around.missing {
                 let here = cell.height - predicted(kernel, cell);
-                fit.add(&[s, sw, se, w], here, field.expected(kernel, cell).powi(-2));
+                fit.add(&[s, sw, se, w], here, inverse_square(field.expected(kernel, cell)));
             }
         });
     }

@@ -12,6 +12,8 @@ pub(super) struct Sampler<T> {
 }
 
 struct Kept<T> {
+    /// Its number among those offered.
+    number: u64,
     priority: f64,
     importance: f64,
     sample: T,
@@ -30,7 +32,7 @@ impl<T> Sampler<T> {
         if priority <= self.out {
             return;
         }
-        self.kept.push(Kept { priority, importance, sample: sample() });
+        self.kept.push(Kept { number: self.offered, priority, importance, sample: sample() });
         if self.kept.len() == 2 * self.most + 1 {
             self.prune();
         }
@@ -46,9 +48,10 @@ impl<T> Sampler<T> {
         self.kept.truncate(self.most);
     }
 
-    /// Those that stay, each with how many it stands for.
+    /// Those that stay, in the order in which they came, each with how many it stands for.
     pub(super) fn finish(mut self) -> impl Iterator<Item = (T, f64)> {
         self.prune();
+        self.kept.sort_unstable_by_key(|kept| kept.number);
         let out = self.out;
         self.kept.into_iter().map(move |kept| (kept.sample, (out / kept.importance).max(1.0)))
     }
@@ -85,8 +88,7 @@ mod tests {
     fn where_there_are_few_all_stay_and_stand_for_themselves() {
         let mut sampler = Sampler::new(10);
         (0..10).for_each(|i| sampler.offer(0.1 + f64::from(i), || i));
-        let mut kept: Vec<(i32, f64)> = sampler.finish().collect();
-        kept.sort_by_key(|(i, _)| *i);
+        let kept: Vec<(i32, f64)> = sampler.finish().collect();
         assert_eq!(kept, (0..10).map(|i| (i, 1.0)).collect::<Vec<_>>());
     }
 }
