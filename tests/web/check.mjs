@@ -22,7 +22,7 @@ const QUICK = width < 900;
 const ERROR_PIXELS = QUICK ? 4 : 2;
 // From the south-west, down into the hills.
 const VIEW = { eye: [2500, 500, 2600], heading: 25, pitch: 32 };
-const PATIENCE = 60_000;
+const PATIENCE = 120_000;
 
 const COMMON = ['--no-sandbox', '--disable-quic', '--no-first-run', '--disable-background-networking',
     '--disable-component-update', '--disable-sync', '--use-angle=swiftshader'];
@@ -286,6 +286,8 @@ async function touch(browser, graphics) {
 
 /// A page that says what to choose from, if it is not told.
 async function choice(page) {
+    // A page that draws all along keeps the next one of its process waiting, on a busy machine for a minute and more.
+    await page.goto('about:blank');
     await page.goto(`${url}/`);
     const links = page.locator('#message a');
     await links.first().waitFor();
