@@ -156,7 +156,12 @@ impl Crew {
     fn start() -> std::io::Result<Self> {
         let count = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
         let member = |number: usize| {
-            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+            let mut builder = tokio::runtime::Builder::new_current_thread();
+            builder.enable_all();
+            // Whoever has answered all that came in lets others have the core, where there are fewer cores than work: else
+            // answers pile up that nobody gets to read, and the latest are late by whole turns of the scheduler.
+            builder.on_thread_park(std::thread::yield_now);
+            let runtime = builder.build()?;
             let (handle, (leave, left)) = (runtime.handle().clone(), oneshot::channel::<()>());
             std::thread::Builder::new().name(format!("serve-{number}")).spawn(move || {
                 // Until the crew is dropped.

@@ -104,7 +104,7 @@ pub(super) fn tagged(
         let detail = format!("this has the tag \"{tag}\", which If-Match does not name");
         return Refusal::new(StatusCode::PRECONDITION_FAILED, detail).into_response();
     }
-    let common = [(header::ETAG, format!("\"{tag}\"")), (header::CACHE_CONTROL, cache.to_owned())];
+    let common = ([(header::ETAG, format!("\"{tag}\""))], [(header::CACHE_CONTROL, cache)]);
     if names(headers, &header::IF_NONE_MATCH, tag) {
         return (StatusCode::NOT_MODIFIED, common).into_response();
     }

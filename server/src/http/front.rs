@@ -14,7 +14,7 @@ use super::still::{Activity, Answering};
 use axum::Router;
 use axum::body::{Body, Bytes};
 use axum::http::{
-    HeaderMap, HeaderName, HeaderValue, Method, Request, Response, StatusCode, Version, header,
+    HeaderMap, HeaderName, HeaderValue, Method, Request, Response, StatusCode, Uri, Version, header,
 };
 use axum::response::IntoResponse;
 use http_body::{Body as _, Frame, SizeHint};
@@ -100,7 +100,7 @@ impl Front {
             from: connection.from,
             id: self.ids.of(request.headers().get(REQUEST_ID).and_then(|value| value.to_str().ok())),
             method: request.method().clone(),
-            path: request.uri().path().chars().take(PATH_SHOWN).collect(),
+            uri: request.uri().clone(),
             route: NO_ROUTE,
             status: StatusCode::OK,
             sent: 0,
@@ -117,7 +117,7 @@ impl Front {
             }
         };
         if let Some(Cause(cause)) = response.extensions_mut().remove() {
-            tracing::error!(id = ended.id, path = ended.path, %cause, "store");
+            tracing::error!(id = ended.id, path = ended.path(), %cause, "store");
         }
         let filed = response.extensions_mut().remove();
         // Answers without a body never take it off.
@@ -224,12 +224,19 @@ struct Ended {
     from: SocketAddr,
     id: String,
     method: Method,
-    /// Without the query, where secrets might be.
-    path: String,
+    uri: Uri,
     route: &'static str,
     status: StatusCode,
     sent: u64,
     is_whole: bool,
+}
+
+impl Ended {
+    /// What the log shows of the address: not the query, where secrets might be.
+    fn path(&self) -> &str {
+        let path = self.uri.path();
+        path.char_indices().nth(PATH_SHOWN).map_or(path, |(end, _)| &path[..end])
+    }
 }
 
 impl Drop for Ended {
@@ -242,7 +249,7 @@ impl Drop for Ended {
             id = self.id,
             from = %self.from,
             method = %self.method,
-            path = self.path,
+            path = self.path(),
             route = self.route,
             status = self.status.as_u16(),
             bytes = self.sent,
@@ -279,7 +286,7 @@ impl http_body::Body for Held {
                 self.ended.is_whole = self.body.is_end_stream();
             }
             Poll::Ready(Some(Err(error))) => {
-                tracing::error!(id = self.ended.id, path = self.ended.path, %error, "an answer is cut off");
+                tracing::error!(id = self.ended.id, path = self.ended.path(), %error, "an answer is cut off");
             }
             Poll::Ready(None) => self.ended.is_whole = true,
             Poll::Pending => {}
