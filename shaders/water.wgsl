@@ -125,10 +125,13 @@ fn scene_ahead(place: vec2<f32>) -> vec2<f32> {
     return ahead * vec2<f32>(1.0, frame.forward.z + clip.x * frame.right.z + clip.y * frame.up.z);
 }
 
+// How far ahead of the eye nothing is any more.
+const NOTHING_AHEAD: f32 = 1e9;
+
 // The last place on the way from one place of the screen to another that is of use to a surface `level` metres above the eye and
-// `ahead` of it. What is below it is hidden by banks and by whatever is nearer than it; what it mirrors (`up`), by far banks alone,
-// as the mirrored picture shows what is behind them there, not their foot, which is clipped. A bank in one piece is found to a 32nd
-// of the way.
+// `ahead` of it. What is below it is hidden by banks and by whatever is nearer than it, and ends where there is nothing; what it
+// mirrors (`up`), by far banks alone, as the mirrored picture shows what is behind them there, not their foot, which is clipped. A
+// bank in one piece is found to a 32nd of the way.
 fn last_place(here: vec2<f32>, there: vec2<f32>, level: f32, ahead: f32, up: bool) -> vec2<f32> {
     var low = 0.0;
     var high = 1.0;
@@ -136,8 +139,9 @@ fn last_place(here: vec2<f32>, there: vec2<f32>, level: f32, ahead: f32, up: boo
     for (var i = 0; i < 6; i++) {
         let found = scene_ahead(mix(here, there, middle));
         let is_near = found.x < ahead;
-        let is_bank = found.y > level && found.y < 1e9;
-        if select(is_near || is_bank, is_bank && !is_near, up) {
+        let is_bank = found.y > level && found.y < NOTHING_AHEAD;
+        let is_end = !up && found.x >= NOTHING_AHEAD;
+        if select(is_near || is_bank || is_end, is_bank && !is_near, up) {
             high = middle;
         } else {
             low = middle;
@@ -148,6 +152,22 @@ fn last_place(here: vec2<f32>, there: vec2<f32>, level: f32, ahead: f32, up: boo
         middle = 0.5 * (low + high);
     }
     return mix(here, there, low);
+}
+
+// A place of the screen, or the middle of its pixel where a picture of what is more than `ahead` metres ahead of the eye would mix
+// in what is nearer, or nothing: behind a crest the mixture is a place in the air before the water, in the crest's colour.
+fn unmixed(place: vec2<f32>, ahead: f32) -> vec2<f32> {
+    let size = vec2<f32>(textureDimensions(scene));
+    let low = (floor(place * size - 0.5) + 0.5) / size;
+    let high = low + 1.0 / size;
+    let a = exact_depth(low);
+    let b = exact_depth(vec2<f32>(high.x, low.y));
+    let c = exact_depth(vec2<f32>(low.x, high.y));
+    let d = exact_depth(high);
+    let nearest = water.optics.z / max(max(max(a, b), max(c, d)), 1e-20);
+    let farthest = water.optics.z / max(min(min(a, b), min(c, d)), 1e-20);
+    let is_mixed = nearest < 0.99 * ahead || (farthest >= NOTHING_AHEAD && nearest < NOTHING_AHEAD);
+    return select(place, (floor(place * size) + 0.5) / size, is_mixed);
 }
 
 // The part of the way from a place of the screen to another that is on it.
@@ -288,10 +308,11 @@ fn water_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
     let down = max(abs(bent.z), 0.05);
     let bed = projected(p + bent * min(depth / down, 1e7));
     var place = here;
-    if !from_below && bed.z > 0.0 {
-        // What stands before the surface is not seen through it.
+    if !from_below && bed.z > 0.0 && straight * ahead < NOTHING_AHEAD {
+        // What stands before the surface is not seen through it, nor what is beside a bed's end.
         let end = mix(here, bed.xy, way_on_screen(here, bed.xy));
-        place = last_place(here, end, p.z, dot(p, frame.forward.xyz), false);
+        let forward = dot(p, frame.forward.xyz);
+        place = unmixed(last_place(here, end, p.z, forward, false), forward);
         let other_ray = ray_through(place);
         let other_depth = p.z - other_ray.z * scene_distance(place, dot(other_ray, frame.forward.xyz));
         // Behind a crest above the eye there may be the sky alone.
