@@ -1,6 +1,6 @@
 //! How a frame looks: light, colours, water.
 
-use diamantina_protocol::message::Scene;
+use diamantina_protocol::message::{Kind, Scene};
 use glam::DVec3;
 
 /// How a frame looks.
@@ -62,13 +62,16 @@ impl Look {
         self.water.reflecting && !self.wireframe
     }
 
-    /// How a scene looks unless told otherwise: other bodies than the Earth are grey, without air, and the sun
-    /// stands low, as plains of dust show little relief else.
+    /// How a scene looks unless told otherwise. Other bodies than the Earth are grey, without air, and the sun stands low, as
+    /// plains of dust show little relief else. Under layers of water the ground has no sea of its own: it would tell depths twice,
+    /// and end in a hard edge where the water's shore is soft.
     #[must_use]
     pub fn of(scene: &Scene) -> Self {
         let radius = scene.frame.crs.as_ref().and_then(|crs| crs.proj4.as_deref()).and_then(radius);
         if radius.is_none_or(|metres| (metres - EARTH_RADIUS).abs() < 100_000.0) {
-            return Self::default();
+            let is_wet = scene.layers.iter().any(|layer| layer.kind == Kind::Water);
+            let colours = if is_wet { Colours::Terrain } else { Colours::Auto };
+            return Self { colours, ..Self::default() };
         }
         let black = Background::Colour([0.003, 0.003, 0.004, 1.0]);
         let sun = Sun { altitude_degrees: 20.0, ..Sun::default() };

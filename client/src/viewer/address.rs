@@ -75,12 +75,12 @@ impl Viewer {
         view
     }
 
-    /// Goes to what follows the `#` of an address: flies there, and sets the time and what heights are multiplied by, if
-    /// it tells of them. Whether it is a view.
+    /// Goes to what follows the `#` of an address: flies there, sets what heights are multiplied by, 1 unless it tells of that,
+    /// and the time, if it tells of it. Whether it is a view.
     pub fn go_to(&mut self, view: &str) -> bool {
         let Some(view) = View::parse(view, self.camera().size) else { return false };
-        if let Some(exaggeration) = view.exaggeration.filter(|_| !self.is_true()) {
-            self.set_exaggeration(exaggeration);
+        if !self.is_true() {
+            self.set_exaggeration(view.exaggeration.unwrap_or(1.0));
         }
         self.fly_to(&view.camera);
         self.set_time(view.seconds);

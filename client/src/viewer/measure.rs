@@ -2,6 +2,7 @@
 
 use super::Viewer;
 use super::boxes::seen;
+use crate::camera::Camera;
 use egui::{Align2, Color32, FontId, RichText, Stroke, Ui};
 use glam::DVec3;
 
@@ -31,10 +32,12 @@ pub struct Mark {
 #[derive(Debug, Default)]
 pub(super) struct Profile {
     ends: Option<[DVec3; 2]>,
-    /// The height at places evenly spread from the first to the last, in metres; `None` where there is no ground.
+    /// The height at places evenly spread from the first to the last, in metres, as it was last seen; `None` where there is no
+    /// ground or none was seen.
     heights: Vec<Option<f64>>,
-    /// Whether it shows all that was asked for, and frames since it was looked at.
-    is_final: bool,
+    /// From where it was looked at when all that was asked for was there.
+    seen_from: Option<Camera>,
+    /// Frames since it was looked at.
     age: u32,
 }
 
@@ -45,10 +48,22 @@ impl Profile {
         &self.heights
     }
 
-    /// Metres from the first place to the last, over the ground: each step counts as long as it is.
-    fn length(&self) -> f64 {
+    /// Metres on the level from one of the places to the next.
+    fn step(&self) -> f64 {
         let Some([first, last]) = self.ends else { return 0.0 };
-        let step = (last - first).truncate().length() / (self.heights.len().max(2) - 1) as f64;
+        (last - first).truncate().length() / (self.heights.len().max(2) - 1) as f64
+    }
+
+    /// Metres on the level without ground, or where none was seen.
+    fn unseen(&self) -> f64 {
+        let gaps = self.heights.windows(2).filter(|pair| pair.contains(&None)).count();
+        self.step() * gaps as f64
+    }
+
+    /// Metres from the first place to the last, over the ground: each step counts as long as it is, and is level where there is
+    /// none.
+    fn length(&self) -> f64 {
+        let step = self.step();
         let rises = self.heights.windows(2).map(|pair| match pair {
             [Some(a), Some(b)] => b - a,
             _ => 0.0,
@@ -69,20 +84,25 @@ pub(super) fn follow(viewer: &mut Viewer) {
         return;
     }
     let ends = Some([first.place, last.place]);
+    let camera = *viewer.camera();
     let profile = &mut viewer.profile;
     profile.age += 1;
     let is_new = profile.ends != ends;
-    let is_due = !profile.is_final && (viewer.frame.complete || profile.age >= FRAMES);
+    let is_due = profile.seen_from != Some(camera) && (viewer.frame.complete || profile.age >= FRAMES);
     if !is_new && !is_due {
         return;
     }
     let (layers, exaggeration) = (&viewer.terrain.scene().layers, viewer.look.exaggeration);
+    // What is out of sight now stays as it was seen.
+    let before = if is_new { Vec::new() } else { std::mem::take(&mut viewer.profile.heights) };
     let heights = (0..=SAMPLES).map(|i| {
         let place = first.place.lerp(last.place, i as f64 / SAMPLES as f64).truncate();
-        Some(viewer.picker.ground(layers, &viewer.frame.items, exaggeration, place)? / exaggeration)
+        let drawn = viewer.picker.ground(layers, &viewer.frame.items, exaggeration, place);
+        drawn.map(|height| height / exaggeration).or_else(|| before.get(i).copied().flatten())
     });
     let heights = heights.collect();
-    viewer.profile = Profile { ends, heights, is_final: viewer.frame.complete, age: 0 };
+    viewer.profile =
+        Profile { ends, heights, seen_from: viewer.frame.complete.then_some(camera), age: 0 };
 }
 
 /// Digits after the point of metres in a scene with such cells: a hundredth of one is told.
@@ -161,6 +181,10 @@ pub(super) fn show(viewer: &Viewer, ui: &mut Ui) {
             ui.monospace(format!("{apart} m apart on the level, {} m {way}", metres(by.z.abs())));
             if viewer.profile.ends.is_some() {
                 ui.monospace(format!("{} m over the ground", metres(viewer.profile.length())));
+                let unseen = viewer.profile.unseen();
+                if unseen > 0.0 {
+                    ui.monospace(format!("{} m of them were not seen, and count as level", metres(unseen)));
+                }
                 plot(&viewer.profile, digits, ui);
             }
         }
@@ -206,7 +230,7 @@ fn plot(profile: &Profile, digits: usize, ui: &mut Ui) {
     corner(Align2::LEFT_BOTTOM, format!("{} m", metres(low, digits)));
     if let Some([first, last]) = profile.ends {
         let length = (last - first).truncate().length();
-        corner(Align2::RIGHT_BOTTOM, format!("{} m →", metres(length, digits - 1)));
+        corner(Align2::RIGHT_BOTTOM, format!("{} m", metres(length, digits - 1)));
     }
     if let (Some(pointer), Some([first, last])) = (response.hover_pos(), profile.ends) {
         let part = f64::from(((pointer.x - rect.left()) / rect.width()).clamp(0.0, 1.0));
@@ -252,5 +276,7 @@ mod tests {
         // 3, 4, 5: a hundred metres on the level and 75 up.
         assert_eq!(of(vec![Some(0.0), Some(75.0), Some(0.0)]), 250.0);
         assert_eq!(of(vec![Some(0.0), None, Some(75.0)]), 200.0);
+        let heights = vec![Some(0.0), Some(75.0), None, None, None];
+        assert_eq!(Profile { ends, heights, ..Profile::default() }.unseen(), 150.0);
     }
 }

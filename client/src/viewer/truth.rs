@@ -8,6 +8,7 @@ use crate::render::Look;
 pub(super) struct Untrue {
     look: Look,
     morph_seconds: f64,
+    texture: Option<usize>,
 }
 
 impl Viewer {
@@ -24,10 +25,16 @@ impl Viewer {
     /// smoothed, as they were when it was opened; pictures that are saved have one sample a pixel.
     pub fn set_true(&mut self, is_true: bool) {
         if is_true {
-            self.untrue = Some(Untrue { look: self.look, morph_seconds: self.terrain.morph_seconds() });
+            self.untrue = Some(Untrue {
+                look: self.look,
+                morph_seconds: self.terrain.morph_seconds(),
+                texture: self.terrain.texture(),
+            });
             self.set_exaggeration(1.0);
             self.look = self.look.truthful();
             self.terrain.set_morph_seconds(0.0);
+            // Colours tell heights, unless a picture is asked for from now on.
+            self.terrain.set_texture(None);
             return;
         }
         let before = self.untrue.take();
@@ -38,6 +45,9 @@ impl Viewer {
         // What may be chosen in between stays as it was chosen.
         let Look { sun, colours, range, wireframe, annotations, .. } = self.look;
         self.look = Look { sun, colours, range, wireframe, annotations, ..look };
+        if let (Some(Untrue { texture, .. }), None) = (before, self.terrain.texture()) {
+            self.terrain.set_texture(texture);
+        }
         self.terrain.set_morph_seconds(before.map_or(super::MORPH_SECONDS, |before| before.morph_seconds));
     }
 }
