@@ -8,6 +8,8 @@ after each answer, which is about the same load for all.
 nginx is asked twice, since its workers take connections from one queue as they are awake: in some rounds one worker has
 nearly all of them, and the other leaves its core to wrk. With `reuseport` the system deals them out. The busiest worker's
 part of the processor time tells which it was.
+
+Last, batches of blobs, and how many files of their size nginx sends: no server can send more bytes than that by far.
 """
 
 import argparse
@@ -19,6 +21,7 @@ import statistics
 import subprocess
 import sys
 import time
+import urllib.request
 
 SIZES = ["1kB", "8kB", "64kB"]
 
@@ -131,6 +134,11 @@ def medians(rounds):
     return [statistics.median(values) for values in zip(*rounds)]
 
 
+def bytes_of(port, path):
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}") as answer:
+        return len(answer.read())
+
+
 def script_of(text, folder, name, paths):
     script = f"{folder}/{name}.lua"
     with open(script, "w") as f:
@@ -186,16 +194,29 @@ def main():
                 lines.append(f"| {size} | {other} | {' | '.join(ratios)} |")
         print("\n| blobs | diamantina to | requests/s | CPU a request | p99 | p99 at equal load |\n|---|---|---|---|---|---|")
         print("\n".join(lines))
-        print("\n| blobs | diamonds a batch | batches/s | diamonds/s | of single requests' |\n|---|---|---|---|---|")
+        print(
+            "\n| blobs | diamonds a batch | batches/s | diamonds/s | of single requests' | files of a batch's size, nginx |"
+            "\n|---|---|---|---|---|---|"
+        )
         for size in SIZES:
             lines = [line.split(" ", 1) for line in open(f"{folder}/{size}.batches").read().splitlines()]
-            with open(f"{folder}/{size}.batch.paths", "w") as f:
-                f.writelines(route + "\n" for _, route in lines)
-            script = script_of(LUA, folder, f"{size}.batch", f"{size}.batch")
+            routes, name = [route for _, route in lines], f"{size}.batch"
+            length = sum(bytes_of(ports["diamantina"], route) for route in routes) // len(routes)
+            with open(f"{folder}/files/{name}", "wb") as f:
+                f.write(os.urandom(length))
+            rounds = {"diamantina": [], "nginx, reuseport": []}
+            for server, paths in (("diamantina", routes), ("nginx, reuseport", [f"/{name}"])):
+                with open(f"{folder}/{name}.paths", "w") as f:
+                    f.writelines(path + "\n" for path in paths)
+                script = script_of(LUA, folder, name, name)
+                for _ in range(options.rounds):
+                    rounds[server].append(measure(ports[server], of[server], script, options))
+            rate, files = (medians(rounds[server])[0] for server in rounds)
             mean = sum(int(count) for count, _ in lines) / len(lines)
-            server = ports["diamantina"], of["diamantina"]
-            rate = medians([measure(*server, script, options) for _ in range(options.rounds)])[0]
-            print(f"| {size} | {mean:.0f} | {rate:.0f} | {rate * mean:.0f} | {rate * mean / rates[size]:.1f} |", flush=True)
+            print(
+                f"| {size} | {mean:.0f} | {rate:.0f} | {rate * mean:.0f} | {rate * mean / rates[size]:.1f} | {files:.0f}/s |",
+                flush=True,
+            )
     finally:
         for server in (nginx, diamantina):
             server.send_signal(signal.SIGTERM)
