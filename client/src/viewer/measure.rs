@@ -101,8 +101,7 @@ pub(super) fn follow(viewer: &mut Viewer) {
         drawn.map(|height| height / exaggeration).or_else(|| before.get(i).copied().flatten())
     });
     let heights = heights.collect();
-    viewer.profile =
-        Profile { ends, heights, seen_from: viewer.frame.complete.then_some(camera), age: 0 };
+    viewer.profile = Profile { ends, heights, seen_from: viewer.frame.complete.then_some(camera), age: 0 };
 }
 
 /// Digits after the point of metres in a scene with such cells: a hundredth of one is told.

@@ -14,6 +14,7 @@ use hyper::service::service_fn;
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto;
 use hyper_util::server::graceful::{GracefulShutdown, Watcher};
+use std::cell::Cell;
 use std::collections::HashMap;
 use std::convert::Infallible;
 use std::net::{IpAddr, SocketAddr};
@@ -27,6 +28,16 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
 
 /// The pause after the system refused to accept, for want of files or memory.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
+
+/// Requests that a thread takes in one turn where there is more to do than a machine can: from then on it lets others have the
+/// core once all are answered. Else answers pile up that nobody gets to read, and the latest are late by whole turns of the
+/// scheduler. Where there is less to do it is this thread that would be late.
+const MANY: u32 = 6;
+
+thread_local! {
+    /// Requests that this thread has taken since it last had nothing to do.
+    static TAKEN: Cell<u32> = const { Cell::new(0) };
+}
 
 /// Serves what is behind `front` on connections of `listener` until `stop` is done and the answers under way have ended,
 /// or had [`Limits::drain`] to do so.
@@ -158,9 +169,11 @@ impl Crew {
         let member = |number: usize| {
             let mut builder = tokio::runtime::Builder::new_current_thread();
             builder.enable_all();
-            // Whoever has answered all that came in lets others have the core, where there are fewer cores than work: else
-            // answers pile up that nobody gets to read, and the latest are late by whole turns of the scheduler.
-            builder.on_thread_park(std::thread::yield_now);
+            builder.on_thread_park(|| {
+                if TAKEN.replace(0) >= MANY {
+                    std::thread::yield_now();
+                }
+            });
             let runtime = builder.build()?;
             let (handle, (leave, left)) = (runtime.handle().clone(), oneshot::channel::<()>());
             std::thread::Builder::new().name(format!("serve-{number}")).spawn(move || {
@@ -199,6 +212,7 @@ impl Visit {
         let io = TokioIo::new(Box::pin(Watched::new(stream, Arc::clone(&connection.activity), patience)));
         let service = service_fn(move |request| {
             let (front, connection) = (Arc::clone(&front), Arc::clone(&connection));
+            TAKEN.set(TAKEN.get().saturating_add(1));
             async move { Ok::<_, Infallible>(front.answer(&connection, request).await) }
         });
         let served = builder.serve_connection(io, service).into_owned();
