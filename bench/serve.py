@@ -9,7 +9,7 @@ nginx is asked twice, since its workers take connections from one queue as they 
 nearly all of them, and the other leaves its core to wrk. With `reuseport` the system deals them out. The busiest worker's
 part of the processor time tells which it was.
 
-Last, batches of blobs, and how many files of their size nginx sends: no server can send more bytes than that by far.
+Last, batches of blobs, and how many files of their size nginx sends: what the machine can move at all.
 """
 
 import argparse
