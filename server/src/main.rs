@@ -32,10 +32,6 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::signal::unix::{SignalKind, signal};
 
-/// Not the system's: a request takes dozens of small pieces of memory, and an eighth less processor time with this one.
-#[global_allocator]
-static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
-
 /// The exit code of a build that was asked to stop.
 const INTERRUPTED: u8 = 130;
 
