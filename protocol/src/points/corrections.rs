@@ -33,7 +33,8 @@
 )]
 
 use super::coding::{Coding, Place};
-use super::model::{FIRST_CORRECTION, REFINER_PASSES, Refiner, SPREAD_PARTS, SPREADS, TILT_PARTS, TILTS};
+use super::model::{REFINER_PASSES, Refiner, SPREAD_PARTS, TILT_PARTS};
+use super::tables::{FIRST_CORRECTION, SPREADS, TILTS};
 use super::walk::HEIGHT_BITS;
 use super::{DecodeError, Pass, Tally};
 use crate::NODATA;

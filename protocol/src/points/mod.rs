@@ -46,9 +46,11 @@
 )]
 
 pub mod model;
+pub mod tables;
 
 mod coding;
 mod corrections;
+mod counts;
 mod rows;
 mod train;
 mod walk;
@@ -61,7 +63,8 @@ use crate::diamond::{Block, Diamond};
 use crate::rans::{Context, Decoder, Encoder};
 use crate::{HEIGHT_MAX, NODATA};
 use corrections::Parts;
-use model::{Counts, Tables};
+use counts::Counts;
+use tables::Tables;
 use walk::{Known, is_inferred, walk, walk_new};
 
 /// The format that this build writes, and the only one that it reads.

@@ -23,7 +23,8 @@
     reason = "heights less their base are below 2^25 and are clamped to 2^22 before they become integers again"
 )]
 
-use super::model::{Kernel, PAIRS, class};
+use super::model::{Kernel, PAIRS};
+use super::tables::class;
 use crate::NODATA;
 
 /// Predictions beyond this many quanta from the base are cut off: far from any real ground, and what a

@@ -9,8 +9,9 @@
 
 use super::coding::{Coding, Place, Rule};
 use super::corrections::walk_corrections;
-use super::model::{CAUSAL_BITS, Kernel, class};
+use super::model::{CAUSAL_BITS, Kernel};
 use super::rows::{Below, Ground, Row, activity, complete};
+use super::tables::class;
 use super::{DecodeError, Pass, Tally};
 use crate::bintree::Forest;
 use crate::diamond::{Block, Diamond, Local};

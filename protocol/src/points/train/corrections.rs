@@ -3,7 +3,8 @@
 use super::super::Pass;
 use super::super::coding::Coding;
 use super::super::corrections::Parts;
-use super::super::model::{REFINER_PASSES, Refiner, SPREAD_PARTS, TILT_PARTS, Tables};
+use super::super::model::{REFINER_PASSES, Refiner, SPREAD_PARTS, TILT_PARTS};
+use super::super::tables::Tables;
 use super::super::walk::walk_old;
 use super::fit::{Fit, fixed, inverse_square};
 use super::likelihood::{Likelihood, MEAN_TO_SPREAD, SEEN, Seen, product};

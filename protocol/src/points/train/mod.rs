@@ -26,7 +26,8 @@ mod sampler;
 
 use super::Rounder;
 use super::coding::Coding;
-use super::model::{Counts, Kernel, Model, REFINER_PASSES, Refiner};
+use super::counts::Counts;
+use super::model::{Kernel, Model, REFINER_PASSES, Refiner};
 use super::walk::{Known, walk_new, walk_old, way};
 use crate::bintree::Forest;
 use crate::diamond::{Block, Diamond};
