@@ -85,24 +85,39 @@ fn exact_depth(place: vec2<f32>) -> f32 {
     return textureSampleLevel(scene_depth, exact_sampler, place, 0.0).x;
 }
 
+// The middle of the pixel up and to the left of a place of the screen, of the four around it.
+fn corner_of(place: vec2<f32>, size: vec2<f32>) -> vec2<f32> {
+    return floor(place * size - 0.5) + 0.5;
+}
+
+// The depths of the four pixels around a place of the screen: the upper two, then the lower two.
+fn depths_around(place: vec2<f32>, size: vec2<f32>) -> vec4<f32> {
+    let low = corner_of(place, size) / size;
+    let high = low + 1.0 / size;
+    return vec4<f32>(
+        exact_depth(low), exact_depth(vec2<f32>(high.x, low.y)), exact_depth(vec2<f32>(low.x, high.y)), exact_depth(high),
+    );
+}
+
+fn least_of(v: vec4<f32>) -> f32 {
+    return min(min(v.x, v.y), min(v.z, v.w));
+}
+
+fn most_of(v: vec4<f32>) -> f32 {
+    return max(max(v.x, v.y), max(v.z, v.w));
+}
+
 // The depth of the scene without water at a place of the screen, between the four pixels around it: the nearest pixel's
 // would jump, and its jumps show as contours of the bed. One over the distance is straight along a plane, so that it may be
 // mixed as it is; not across an outline, where nothing lies between what is near and what is far.
 fn depth_at(place: vec2<f32>) -> f32 {
     let size = vec2<f32>(textureDimensions(scene));
-    let corner = floor(place * size - 0.5) + 0.5;
-    let part = place * size - corner;
-    let low = corner / size;
-    let high = (corner + 1.0) / size;
-    let a = exact_depth(low);
-    let b = exact_depth(vec2<f32>(high.x, low.y));
-    let c = exact_depth(vec2<f32>(low.x, high.y));
-    let d = exact_depth(high);
-    let least = min(min(a, b), min(c, d));
-    if max(max(a, b), max(c, d)) > 1.25 * least {
+    let around = depths_around(place, size);
+    if most_of(around) > 1.25 * least_of(around) {
         return exact_depth(place);
     }
-    return mix(mix(a, b, part.x), mix(c, d, part.x), part.y);
+    let part = place * size - corner_of(place, size);
+    return mix(mix(around.x, around.y, part.x), mix(around.z, around.w, part.x), part.y);
 }
 
 // Metres from the eye to what the scene without water shows at a place of the screen, along a ray that goes `forward`
@@ -158,14 +173,9 @@ fn last_place(here: vec2<f32>, there: vec2<f32>, level: f32, ahead: f32, up: boo
 // in what is nearer, or nothing: behind a crest the mixture is a place in the air before the water, in the crest's colour.
 fn unmixed(place: vec2<f32>, ahead: f32) -> vec2<f32> {
     let size = vec2<f32>(textureDimensions(scene));
-    let low = (floor(place * size - 0.5) + 0.5) / size;
-    let high = low + 1.0 / size;
-    let a = exact_depth(low);
-    let b = exact_depth(vec2<f32>(high.x, low.y));
-    let c = exact_depth(vec2<f32>(low.x, high.y));
-    let d = exact_depth(high);
-    let nearest = water.optics.z / max(max(max(a, b), max(c, d)), 1e-20);
-    let farthest = water.optics.z / max(min(min(a, b), min(c, d)), 1e-20);
+    let around = depths_around(place, size);
+    let nearest = water.optics.z / max(most_of(around), 1e-20);
+    let farthest = water.optics.z / max(least_of(around), 1e-20);
     let is_mixed = nearest < 0.99 * ahead || (farthest >= NOTHING_AHEAD && nearest < NOTHING_AHEAD);
     return select(place, (floor(place * size) + 0.5) / size, is_mixed);
 }

@@ -267,6 +267,36 @@ fn waves_mirror_no_bank_on_this_side_of_the_water() {
     assert!(water.len() > 1000 && patches == 0, "{patches} of {} pixels", water.len());
 }
 
+/// Where a crest hides the place that is seen through the surface above it, pixels of the crest floated there, in combs and dots.
+#[test]
+fn no_crest_is_seen_through_the_water_behind_it() {
+    let shore = Shore::new(0.0, |x, y| if (16..=24).contains(&y) { 900 - 8 * x as i32 } else { -600 });
+    let camera = Camera {
+        eye: shore.land.place(0.5, -3.0, 800.0),
+        target: shore.land.place(0.5, 0.6, 0.0),
+        fov_y: 0.25,
+        size: [300, 200],
+    };
+    // Bright land in water that lets nothing through from where it is deep.
+    let look = Look { water: Water { clarity: Some(1.0), ..CALM }, colours: Colours::Flat, ..PLAIN };
+    let plain = Look { water: Water { reflecting: false, ..CALM }, ..look };
+    let [picture, flat, dry] = [
+        shore.picture(&camera, &shore.items, &look, 1),
+        shore.picture(&camera, &shore.items, &plain, 1),
+        shore.picture(&camera, &shore.land_items(), &look, 1),
+    ];
+    // Down each column there is sky, water behind the crest, and then the crest.
+    let is_water = |p: [u32; 2]| flat.pixel(p) != dry.pixel(p);
+    let rows = |x: u32| {
+        let first = (0..200).find(|y| is_water([x, *y])).unwrap();
+        first..(first..200).find(|y| !is_water([x, *y])).unwrap()
+    };
+    let land = dry.pixel([150, rows(150).end + 3]).unwrap()[1];
+    let water: Vec<_> = (60..240).flat_map(|x| rows(x).map(move |y| [x, y])).collect();
+    let floating = water.iter().filter(|p| picture.pixel(**p).unwrap()[1] > land / 2).count();
+    assert!(water.len() > 2000 && floating == 0, "{floating} of {} pixels as bright as {land}", water.len());
+}
+
 /// A coast whose ground ends where its samples do had their corners.
 #[test]
 fn a_coast_without_a_bed_has_no_corners() {
