@@ -12,7 +12,7 @@ const SAMPLES: usize = 200;
 /// Cells of the finest layer that two places of a profile are apart at least.
 const APART_CELLS: f64 = 0.1;
 
-/// Frames after which a profile is looked at again while data arrives.
+/// Frames after which a profile is looked at again while data arrives or the eye moves.
 const FRAMES: u32 = 20;
 
 /// A place that was clicked.
@@ -37,7 +37,8 @@ pub(super) struct Profile {
     heights: Vec<Option<f64>>,
     /// From where it was looked at when all that was asked for was there.
     seen_from: Option<Camera>,
-    /// Frames since it was looked at.
+    /// From where the last frame was seen, and frames since it was looked at.
+    eye: Option<Camera>,
     age: u32,
 }
 
@@ -72,25 +73,27 @@ impl Profile {
     }
 }
 
-/// Looks at the ground between the last two marks, where there are two and something may have changed.
-pub(super) fn follow(viewer: &mut Viewer) {
+/// Looks at the ground between the last two marks, where there are two and something may have changed. Whether it is to be looked
+/// at again, though nothing else changes.
+pub(super) fn follow(viewer: &mut Viewer) -> bool {
     let [first, last] = viewer.marks[..] else {
         viewer.profile = Profile::default();
-        return;
+        return false;
     };
     // Of one place there is no profile.
     if (last.place - first.place).truncate().length() < APART_CELLS * viewer.cell() {
         viewer.profile = Profile::default();
-        return;
+        return false;
     }
     let ends = Some([first.place, last.place]);
     let camera = *viewer.camera();
     let profile = &mut viewer.profile;
     profile.age += 1;
+    let stands = profile.eye.replace(camera) == Some(camera);
+    let is_due = profile.age >= FRAMES || (viewer.frame.complete && stands);
     let is_new = profile.ends != ends;
-    let is_due = profile.seen_from != Some(camera) && (viewer.frame.complete || profile.age >= FRAMES);
-    if !is_new && !is_due {
-        return;
+    if !is_new && (profile.seen_from == Some(camera) || !is_due) {
+        return profile.seen_from != Some(camera);
     }
     let (layers, exaggeration) = (&viewer.terrain.scene().layers, viewer.look.exaggeration);
     // What is out of sight now stays as it was seen.
@@ -101,7 +104,9 @@ pub(super) fn follow(viewer: &mut Viewer) {
         drawn.map(|height| height / exaggeration).or_else(|| before.get(i).copied().flatten())
     });
     let heights = heights.collect();
-    viewer.profile = Profile { ends, heights, seen_from: viewer.frame.complete.then_some(camera), age: 0 };
+    let seen_from = viewer.frame.complete.then_some(camera);
+    viewer.profile = Profile { ends, heights, seen_from, eye: Some(camera), age: 0 };
+    seen_from.is_none()
 }
 
 /// Digits after the point of metres in a scene with such cells: a hundredth of one is told.

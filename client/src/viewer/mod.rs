@@ -336,7 +336,7 @@ impl Viewer {
                 self.go_over();
             }
         }
-        measure::follow(self);
+        let has_more = measure::follow(self);
         if with_panel {
             if self.shows_boxes {
                 boxes::show(self, ui);
@@ -354,7 +354,7 @@ impl Viewer {
             self.look.water.seconds += seconds;
         }
         let is_moving = self.frame.moving > 0 || self.controls.is_gliding() || has_waves || self.player.plays;
-        self.goes_on = !self.frame.complete || is_moving;
+        self.goes_on = !self.frame.complete || is_moving || has_more;
         if self.goes_on {
             ui.ctx().request_repaint();
         }

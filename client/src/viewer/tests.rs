@@ -234,6 +234,18 @@ fn two_clicks_tell_the_profile_between_them() {
     let layers = hand.viewer.terrain.scene().layers.clone();
     let ground = hand.viewer.picker.ground(&layers, &hand.viewer.frame.items, 1.0, middle);
     assert_eq!(heights[heights.len() / 2], ground);
+    // What is out of sight stays as it was seen.
+    let eye = hand.camera().eye;
+    hand.viewer.controls.glide_to(Camera { target: eye + DVec3::Z + 0.01 * DVec3::Y, ..hand.camera() });
+    while hand.viewer.controls.is_gliding() {
+        hand.frame(&[]);
+    }
+    hand.settle();
+    hand.frame(&[]);
+    let near = first.place.truncate();
+    assert!(hand.viewer.picker.ground(&layers, &hand.viewer.frame.items, 1.0, near).is_none());
+    let known = |heights: &[Option<f64>]| heights.iter().map(Option::is_some).collect::<Vec<_>>();
+    assert_eq!(known(hand.viewer.profile.heights()), known(&heights));
     hand.key(Key::Escape, true);
     hand.frame(&[]);
     assert!(hand.viewer.profile.heights().is_empty());
@@ -259,8 +271,10 @@ fn views_are_kept_and_found_again() {
     let names: Vec<&str> = again.viewer.bookmarks().iter().map(|one| one.name.as_str()).collect();
     assert_eq!(names, ["view 1", "view 2"]);
     let first = again.viewer.bookmarks()[0].view.clone();
+    again.viewer.set_exaggeration(3.0);
     assert!(again.viewer.go_to(&first));
     again.settle();
+    assert_eq!(again.viewer.look().exaggeration, 1.0, "heights are as they were");
     assert!((again.camera().eye - home.eye).length() < 0.1, "{:?}", again.camera());
 }
 
