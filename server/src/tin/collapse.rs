@@ -28,7 +28,7 @@ use super::ground::Ground;
 use super::mesh::{Mesh, NONE, Star, next, triangle};
 use super::metric::{Costs, between, length, turn};
 use super::square::{Role, Square};
-use super::state::{Around, State, at_least, below, shortened, unshortened, vertex};
+use super::state::{Around, State, at_least, at_most, below, rounded, shortened, unshortened, vertex};
 use super::{Rules, Vertex};
 use std::collections::HashMap;
 
@@ -67,6 +67,9 @@ const LIMIT_SHARE: f64 = 1.3;
 /// How the limit grows: in finer steps there are more passes, and fewer triangles.
 const LIMIT_GROWTH: f64 = 1.06;
 
+/// Vertices that are passed over at once.
+const SIDE_BY_SIDE: usize = 16;
+
 /// Points of the source's border that an edge of the border stands for.
 pub(super) type Passed = HashMap<u32, Vec<[u32; 2]>>;
 
@@ -97,6 +100,8 @@ pub(super) struct Simplifier<'a> {
     costs: Costs,
     /// Of each vertex.
     states: Vec<State>,
+    /// Of each vertex: it cannot go under any limit below this. Known once it has been tried.
+    needed: Vec<f32>,
     /// Vertices that may go in this pass, by rank.
     queue: Vec<u64>,
     /// How far samples are from each triangle, in quanta, if that is known.
@@ -125,6 +130,7 @@ impl<'a> Simplifier<'a> {
     ) -> Self {
         let costs = Costs::new(&mesh, rules.metric, rules.lambda, rules.scale);
         let states = mesh.points.iter().map(|v| State::new(square.role(*v))).collect();
+        let needed = vec![0.0; mesh.points.len()];
         Self {
             mesh,
             passed,
@@ -134,6 +140,7 @@ impl<'a> Simplifier<'a> {
             target: 0,
             costs,
             states,
+            needed,
             queue: Vec::new(),
             errors: before.errors,
             needs: before.needs,
@@ -206,8 +213,9 @@ impl<'a> Simplifier<'a> {
             let state = &mut self.states[v as usize];
             let stays = !tried || state.role == Role::Locked;
             let before = known.get(v as usize).filter(|_| state.role == Role::Free);
-            let needed = before.map_or(0.0, |short| unshortened(*short));
-            (state.needed, state.is_known) = (if stays { f32::INFINITY } else { needed }, false);
+            state.is_known = false;
+            self.needed[v as usize] =
+                if stays { f32::INFINITY } else { before.map_or(0.0, |short| unshortened(*short)) };
         }
     }
 
@@ -215,16 +223,16 @@ impl<'a> Simplifier<'a> {
     fn share_needs(&mut self) -> f64 {
         let mut needs = Vec::with_capacity(self.states.len());
         for v in 0..index(self.states.len()) {
-            if self.states[v as usize].needed == 0.0 {
+            if self.needed[v as usize] == 0.0 {
                 let untouched = self.untouched.get(v as usize).is_some_and(|is| *is);
                 if untouched && !self.mesh.is_at_border(v) {
                     self.bound_in_lattice(v);
                 } else {
-                    self.mesh.look(v, &mut self.star);
+                    self.look(v);
                     self.bound();
                 }
             }
-            needs.extend(Some(self.states[v as usize].needed).filter(|needed| *needed < f32::INFINITY));
+            needs.extend(Some(self.needed[v as usize]).filter(|needed| *needed < f32::INFINITY));
         }
         // Two triangles vanish with an inner vertex.
         let go = self.mesh.live.saturating_sub(self.target) / 2;
@@ -244,14 +252,15 @@ impl<'a> Simplifier<'a> {
         let mut ranks = std::mem::take(&mut self.queue);
         ranks.clear();
         for v in 0..index(self.states.len()) {
-            let (state, at) = (&self.states[v as usize], self.mesh.points[v as usize]);
+            let (state, needed) = (&self.states[v as usize], self.needed[v as usize]);
+            let at = self.mesh.points[v as usize];
             let is_one = state.role == Role::Free
-                && f64::from(state.needed) <= limit
+                && f64::from(needed) <= limit
                 && !(at.x + at.y).is_multiple_of(2)
                 && self.untouched.get(v as usize).is_some_and(|is| *is)
                 && !self.mesh.is_at_border(v);
             if is_one {
-                ranks.push(State { key: state.needed, ..*state }.rank(v));
+                ranks.push(State { key: needed, ..*state }.rank(v));
             }
         }
         let most = self.mesh.live.saturating_sub(self.target) / 2;
@@ -275,17 +284,25 @@ impl<'a> Simplifier<'a> {
         self.queue = ranks;
     }
 
+    /// Looks around a vertex.
+    fn look(&mut self, v: u32) {
+        self.mesh.look(v, &mut self.star);
+        self.fan.look(&self.mesh, &self.star);
+    }
+
     /// Notes what the star's centre needs at least for its own sample, unless it lies at a border.
     fn bound(&mut self) {
         let v = self.star.centre;
         if self.star.border || !self.has_sample(v) {
             return;
         }
-        self.fan.look(&self.mesh, &self.star);
-        let along = self.states[v as usize].role == Role::Along;
-        let (square, points, rim) = (&self.square, &self.mesh.points, &self.star.rim());
-        let off = self.fan.least_off(|to| !along || square.is_along(points[rim[to] as usize]));
-        self.states[v as usize].needed = below(off).max(0.0);
+        let off = if self.states[v as usize].role == Role::Along {
+            let (square, points, rim) = (&self.square, &self.mesh.points, &self.star.rim());
+            self.fan.least_off_of(|to| square.is_along(points[rim[to] as usize]))
+        } else {
+            self.fan.least_off()
+        };
+        self.needed[v as usize] = below(off).max(0.0);
     }
 
     /// [`Simplifier::bound`] of a vertex that no border and nothing but what the source's mesh has is around: it ends up halfway between two opposite
@@ -307,7 +324,7 @@ impl<'a> Simplifier<'a> {
                 least = least.min(0.5 * f64::from(bend.abs()));
             }
         }
-        self.states[v as usize].needed = below(least).max(0.0);
+        self.needed[v as usize] = below(least).max(0.0);
     }
 
     /// Whether the vertex has a sample that is to be kept.
@@ -323,12 +340,12 @@ impl<'a> Simplifier<'a> {
     /// What a vertex needs at least as long as nothing changes around it, shortened; 0 if that is not known, or may change
     /// with what the diamond becomes a part of.
     pub(super) fn known(&self) -> Vec<u16> {
-        let known = |(v, state): (u32, &State)| {
-            let is_sure = state.needed < f32::INFINITY && state.around != Around::Thinned;
+        let known = |(v, (state, needed)): (u32, (&State, &f32))| {
+            let is_sure = *needed < f32::INFINITY && state.around != Around::Thinned;
             let may = state.role == Role::Free && is_sure;
-            if may && !self.mesh.is_at_border(v) { shortened(state.needed) } else { 0 }
+            if may && !self.mesh.is_at_border(v) { shortened(*needed) } else { 0 }
         };
-        (0..).zip(&self.states).map(known).collect()
+        (0..).zip(self.states.iter().zip(&self.needed)).map(known).collect()
     }
 
     /// Which vertices have had nothing gone around them.
@@ -353,19 +370,19 @@ impl<'a> Simplifier<'a> {
             let mut state = self.states[v as usize];
             // Beyond what is enough, and where nothing may be lost, only what is flat goes.
             if !state.is_known && (is_enough || limit <= 0.0) {
-                self.mesh.look(v, &mut self.star);
+                self.look(v);
                 state = self.weigh();
             }
-            if state.needed == f32::INFINITY || (is_enough && !state.flat) {
+            if self.needed[v as usize] == f32::INFINITY || (is_enough && !state.flat) {
                 continue;
             }
-            self.mesh.look(v, &mut self.star);
+            self.look(v);
             let needed = self.find_ways(per_metre);
             match self.first_allowed(limit) {
                 Ok(to) => self.collapse(to),
                 Err(at_least) => {
+                    self.needed[v as usize] = below(needed.min(at_least));
                     let state = &mut self.states[v as usize];
-                    state.needed = below(needed.min(at_least));
                     if state.around == Around::Thinned {
                         state.around = Around::Changed;
                     }
@@ -381,20 +398,30 @@ impl<'a> Simplifier<'a> {
         let mut ranks = std::mem::take(&mut self.queue);
         ranks.clear();
         let has_limit = limit > 0.0 && limit < f64::INFINITY;
-        for v in 0..index(self.states.len()) {
-            let mut state = self.states[v as usize];
-            if state.needed < f32::INFINITY && f64::from(state.needed) <= limit {
+        // What may not go needs more than any limit.
+        let most = at_most(limit).min(f32::MAX);
+        for first in (0..self.needed.len()).step_by(SIDE_BY_SIDE) {
+            let last = self.needed.len().min(first + SIDE_BY_SIDE);
+            // Most need more: so many at once are seen to.
+            if self.needed[first..last].iter().fold(true, |all, needed| all & (*needed > most)) {
+                continue;
+            }
+            for v in index(first)..index(last) {
+                if self.needed[v as usize] > most {
+                    continue;
+                }
+                let mut state = self.states[v as usize];
                 if !state.is_known {
-                    self.mesh.look(v, &mut self.star);
-                    if state.needed == 0.0 && has_limit {
+                    self.look(v);
+                    if self.needed[v as usize] == 0.0 && has_limit {
                         self.bound();
-                        if f64::from(self.states[v as usize].needed) > limit {
+                        if self.needed[v as usize] > most {
                             continue;
                         }
                     }
                     state = self.weigh();
                 }
-                if state.needed < f32::INFINITY {
+                if self.needed[v as usize] < f32::INFINITY {
                     ranks.push(state.rank(v));
                 }
             }
@@ -443,14 +470,15 @@ impl<'a> Simplifier<'a> {
 
     /// Finds out how important a vertex is that is not locked.
     fn weigh(&mut self) -> State {
-        let (key, flat) = self.costs.importance(&self.mesh, &self.star);
+        let (key, flat) = self.costs.importance(&self.mesh, &self.star, &mut self.fan);
         let state = &mut self.states[self.star.centre as usize];
-        #[allow(clippy::cast_possible_truncation, reason = "an order need not be precise")]
-        let key = key.max(0.0) as f32;
+        let key = rounded(key.max(0.0));
         // Where nothing may be lost, and something would be, there is no need to try.
         let stays = !flat && matches!(self.until, Until::Error { vertical: 0.0, .. });
-        let needed = if stays { f32::INFINITY } else { state.needed };
-        *state = State { key, needed, flat, is_known: true, ..*state };
+        if stays {
+            self.needed[self.star.centre as usize] = f32::INFINITY;
+        }
+        *state = State { key, flat, is_known: true, ..*state };
         *state
     }
 
@@ -486,7 +514,6 @@ impl<'a> Simplifier<'a> {
             }
         }
         let mut needed = f64::INFINITY;
-        self.fan.look(mesh, star);
         self.fan.measure();
         // Opposite ways out of four leave the same two triangles.
         let ways = if star.rim().len() == 4 && !star.border && !along { 2 } else { star.rim().len() };
@@ -588,13 +615,13 @@ impl<'a> Simplifier<'a> {
         if let Some(h) = moved.joined.filter(|_| !passed.is_empty()) {
             self.passed.insert(h, passed);
         }
-        self.costs.follow(&self.mesh, &star, to);
+        self.costs.follow(&star, to);
         for (t, distance) in self.found.drain(..) {
             if let Some(error) = self.errors.get_mut(t) {
                 *error = distance;
             }
         }
-        self.states[star.centre as usize].needed = f32::INFINITY;
+        self.needed[star.centre as usize] = f32::INFINITY;
         for v in star.rim() {
             let state = &mut self.states[*v as usize];
             let stays = self.needs_stay && state.around != Around::Changed;
@@ -602,7 +629,7 @@ impl<'a> Simplifier<'a> {
             if state.role != Role::Locked {
                 state.is_known = false;
                 if !stays {
-                    state.needed = 0.0;
+                    self.needed[*v as usize] = 0.0;
                 }
             }
         }

@@ -13,7 +13,7 @@
 use super::Scale;
 use super::few::{FEW, Few, NEAR};
 use super::mesh::{Mesh, Star};
-use super::metric::{Vector, length};
+use super::metric::{Vector, dot, length};
 
 /// A vertex around: along x and y in cells, and in height in quanta.
 type Step = [f64; 3];
@@ -119,9 +119,15 @@ impl Fan {
         Some(off / area)
     }
 
-    /// How far the centre's own sample will be from the surface at least, whichever way the centre goes of those that
-    /// `may` be gone; infinite if there is none.
-    pub(super) fn least_off(&mut self, may: impl Fn(usize) -> bool) -> f64 {
+    /// How far the centre's own sample will be from the surface at least, whichever way the centre goes; infinite if there
+    /// is none.
+    pub(super) fn least_off(&mut self) -> f64 {
+        self.measure();
+        if self.is_few { self.few.least_off() } else { self.least_off_of(|_| true) }
+    }
+
+    /// Likewise of those ways alone that `may` be gone.
+    pub(super) fn least_off_of(&mut self, may: impl Fn(usize) -> bool) -> f64 {
         self.measure();
         let mut least = f64::INFINITY;
         for to in (0..self.count).filter(|to| may(*to)) {
@@ -143,38 +149,60 @@ impl Fan {
         }
     }
 
-    /// How much the normals of the triangles that survive change: the sum of (A + A')/2 (1 - n . n') over them, given
-    /// their area vectors and areas now.
-    pub(super) fn cost(&self, scale: &Scale, to: usize, now: impl Fn(usize) -> (Vector, f64)) -> f64 {
+    /// How much the normals vary: the sum of areas, less the length of the sum of area vectors. With n the direction of that
+    /// sum it is that of A (1 - n_t . n) as well, which is half of A |n_t - n|^2, of which little is lost in rounding.
+    pub(super) fn importance(&mut self, scale: &Scale) -> f64 {
+        if self.is_few {
+            self.few.prepare(Self::metres(scale));
+            return self.few.importance();
+        }
+        let metres = Self::metres(scale);
+        let triangles = self.steps.windows(2).take(self.triangles());
+        let (vectors, mut sum) = (triangles.map(|pair| area_vector(metres, pair[0], pair[1])), [0.0; 3]);
+        for vector in vectors.clone() {
+            sum = std::array::from_fn(|k| sum[k] + vector[k]);
+        }
+        let all = length(sum);
+        let varies = vectors.map(|vector| {
+            let area = length(vector);
+            let off: Vector = std::array::from_fn(|k| vector[k] / area - sum[k] / all);
+            0.5 * area * dot(off, off)
+        });
+        varies.sum()
+    }
+
+    /// How many triangles there are.
+    fn triangles(&self) -> usize {
+        self.count - usize::from(self.border)
+    }
+
+    /// How much the normals of the triangles that survive change: the sum of (A + A')/2 (1 - n . n') over them.
+    pub(super) fn cost(&self, scale: &Scale, to: usize) -> f64 {
         if self.is_few {
             return self.few.cost(to);
         }
         let metres = Self::metres(scale);
         let u = self.steps[to];
-        let with = |p: Step| {
-            [
-                (u[1] * p[2] - u[2] * p[1]) * metres[0],
-                (u[2] * p[0] - u[0] * p[2]) * metres[1],
-                turn(u, p) * metres[2],
-            ]
-        };
-        let rest = self.rest(to);
-        let around = |i: usize| if i < self.count { i } else { i - self.count };
-        let mut sum = 0.0;
-        let mut at = around(rest.start);
-        let mut here = with(self.steps[at]);
-        for _ in rest.start..rest.end - 1 {
-            let after = around(at + 1);
-            let there = with(self.steps[after]);
-            let (old, area) = now(at);
-            let new: Vector = std::array::from_fn(|k| old[k] + here[k] - there[k]);
-            let area_new = length(new);
-            let dot = old[0] * new[0] + old[1] * new[1] + old[2] * new[2];
-            sum += 0.5 * (area + area_new) * (1.0 - dot / (area * area_new));
-            (at, here) = (after, there);
-        }
-        sum
+        let rest = &self.steps[self.rest(to)];
+        let changes = rest.windows(2).map(|pair| {
+            let [p, q] = [pair[0], pair[1]];
+            let old = area_vector(metres, p, q);
+            let new = area_vector(metres, difference(u, p), difference(u, q));
+            let (area, area_new) = (length(old), length(new));
+            0.5 * (area + area_new) * (1.0 - dot(old, new) / (area * area_new))
+        });
+        changes.sum()
     }
+}
+
+fn difference(a: Step, b: Step) -> Step {
+    std::array::from_fn(|k| b[k] - a[k])
+}
+
+/// Of the triangle of the origin and two steps, given [`Fan::metres`].
+fn area_vector(metres: Vector, p: Step, q: Step) -> Vector {
+    let cross = [p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]];
+    std::array::from_fn(|k| cross[k] * metres[k])
 }
 
 #[cfg(test)]
@@ -231,7 +259,7 @@ mod tests {
                     prop_assert!(least <= off && off <= expected * (1.0 + 1e-9), "{off}, expected {expected}");
                 }
             }
-            let found = fan.least_off(is_way);
+            let found = fan.least_off_of(is_way);
             prop_assert!(found <= least, "{found}, expected {least}");
             prop_assert!(turns || found == least, "{found}, expected {least}");
         }

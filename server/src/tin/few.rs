@@ -51,6 +51,12 @@ fn length([a, b, c]: [Vec4; 3]) -> Vec4 {
     (a * a + b * b + c * c).sqrt()
 }
 
+/// The sum of four numbers, in an order of our own: the same on every machine.
+fn in_order(four: Vec4) -> f32 {
+    let [a, b, c, d] = four.to_array();
+    (a + b) + (c + d)
+}
+
 impl Few {
     /// Takes over the vertices around a centre, [`FEW`] at most.
     #[allow(clippy::cast_precision_loss, reason = "below 2^24, but for heights, whose rounding is counted")]
@@ -71,40 +77,61 @@ impl Few {
         }
     }
 
-    /// Finds out how far off the centre's own sample will be, whichever way it goes. Of each way all triangles are looked at
-    /// at once: whether one turns over, and which one will cover the sample.
+    /// Finds out how far off the centre's own sample will be, whichever way it goes. Of each triangle all ways are looked at
+    /// at once: of which it turns over, and of which it will cover the sample.
     pub(super) fn measure(&mut self) {
-        let [x, y, z] = self.here.each_ref().map(eight);
-        let [next_x, next_y, next_z] = self.after.each_ref().map(eight);
-        let turns = each(|i| x[i] * next_y[i] - y[i] * next_x[i]);
-        // Behind all there is no area, and neither have the two triangles at a way itself any left.
-        let behind = u32::MAX << self.count;
-        let mut without = 1 | 1 << (self.count - 1);
-        for to in 0..FEW.min(self.count) {
-            let [u_x, u_y, u_z] = [0, 1, 2].map(|k| Vec4::splat(self.here[k][to]));
-            let from = each(|i| u_x * y[i] - u_y * x[i]);
-            let until = each(|i| u_x * next_y[i] - u_y * next_x[i]);
-            let doubled = each(|i| turns[i] + from[i] - until[i]);
-            let remain = doubled.map(|doubled| doubled.cmpgt(Vec4::ZERO));
-            let [low, high] = remain.map(|remain| remain.bitmask());
-            if low | high << 4 | behind | without != u32::MAX {
-                self.offs[to] = f32::INFINITY;
-            } else {
-                let most = each(|i| {
-                    let (a, b, c) = (turns[i] * u_z, from[i] * next_z[i], until[i] * z[i]);
-                    let surely = (a + b - c).abs() - Vec4::splat(ROUNDING) * (a.abs() + b.abs() + c.abs());
-                    let covers = from[i].cmpge(Vec4::ZERO) & until[i].cmple(Vec4::ZERO) & remain[i];
-                    Vec4::select(covers, surely / doubled[i], Vec4::ZERO)
-                });
-                self.offs[to] = most[0].max(most[1]).max_element();
+        if self.count <= FEW / 2 { self.measure_ways::<1>() } else { self.measure_ways::<2>() }
+    }
+
+    #[inline(always)]
+    fn measure_ways<const FOURS: usize>(&mut self) {
+        let ways = self.here.each_ref().map(eight);
+        let [u_x, u_y, u_z] = ways.each_ref().map(|w| &w[..FOURS]);
+        let with = |i: usize| -> [Vec4; FOURS] {
+            let (x, y) = (Vec4::splat(self.here[0][i % FEW]), Vec4::splat(self.here[1][i % FEW]));
+            std::array::from_fn(|k| u_x[k] * y - u_y[k] * x)
+        };
+        let (mut height, mut area) = ([Vec4::ZERO; FOURS], [Vec4::ONE; FOURS]);
+        // How many triangles keep turning left: all but the two at the way itself have to.
+        let mut remaining = [Vec4::ZERO; FOURS];
+        let mut from = with(0);
+        for i in 0..self.count.min(FEW) {
+            let until = if i + 1 == self.count { with(0) } else { with(i + 1) };
+            let [x, y, z] = self.here.each_ref().map(|w| w[i]);
+            let [next_x, next_y, next_z] = self.after.each_ref().map(|w| w[i]);
+            let turn = Vec4::splat(x * next_y - y * next_x);
+            let (z, next_z) = (Vec4::splat(z), Vec4::splat(next_z));
+            for k in 0..FOURS {
+                let doubled = turn + from[k] - until[k];
+                let remains = doubled.cmpgt(Vec4::ZERO);
+                remaining[k] += Vec4::select(remains, Vec4::ONE, Vec4::ZERO);
+                let (a, b, c) = (turn * u_z[k], from[k] * next_z, until[k] * z);
+                let surely = (a + b - c).abs() - Vec4::splat(ROUNDING) * (a.abs() + b.abs() + c.abs());
+                let covers = from[k].cmpge(Vec4::ZERO) & until[k].cmple(Vec4::ZERO) & remains;
+                height[k] = Vec4::select(covers, surely, height[k]);
+                area[k] = Vec4::select(covers, doubled, area[k]);
             }
-            without = if to == 0 { 0b11 } else { without << 1 };
+            from = until;
         }
+        #[allow(clippy::cast_precision_loss, reason = "at most eight")]
+        let all = Vec4::splat((self.count - 2) as f32);
+        let mut offs = [Vec4::INFINITY; 2];
+        for k in 0..FOURS {
+            let off = (height[k] / area[k]).max(Vec4::ZERO);
+            offs[k] = Vec4::select(remaining[k].cmpeq(all), off, Vec4::INFINITY);
+        }
+        let [a, b] = offs.map(|four| four.to_array());
+        self.offs = [a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3]];
     }
 
     /// What [`Few::measure`] has found of a way.
     pub(super) fn off(&self, to: usize) -> f64 {
         self.offs[to % FEW].into()
+    }
+
+    /// The least of what [`Few::measure`] has found of all ways.
+    pub(super) fn least_off(&self) -> f64 {
+        self.offs[..self.count.min(FEW)].iter().copied().fold(f32::INFINITY, f32::min).into()
     }
 
     /// Prepares [`Few::cost`], given what the components of cross products have to be scaled by to be area vectors.
@@ -129,6 +156,23 @@ impl Few {
         }
     }
 
+    /// How much the normals vary: half of the sum of A |n_t - n|^2, n the direction of all area vectors together.
+    pub(super) fn importance(&self) -> f64 {
+        // Behind all there is no area, and no normal.
+        let is_there = |area: Vec4| area.cmpgt(Vec4::ZERO);
+        let together = |of: &Eight| in_order(of[0] + of[1]);
+        let vectors = [0, 1, 2].map(|k| each(|i| self.vectors[k][i] * self.metres[k]));
+        let [x, y, z] = vectors.each_ref().map(together);
+        let each_of = 1.0 / (x * x + y * y + z * z).sqrt();
+        let direction = [x * each_of, y * each_of, z * each_of];
+        let of_four = each(|i| {
+            let d = [0, 1, 2].map(|k| self.normals[k][i] - Vec4::splat(direction[k]));
+            let varies = self.areas[i] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
+            Vec4::select(is_there(self.areas[i]), varies, Vec4::ZERO)
+        });
+        0.5 * f64::from(in_order(of_four[0] + of_four[1]))
+    }
+
     /// How much the normals of the triangles that survive change if the centre slides into a vertex: where normals differ
     /// by d, 1 - n . n' is d^2 / 2.
     pub(super) fn cost(&self, to: usize) -> f64 {
@@ -147,8 +191,6 @@ impl Few {
             let change = (area + self.areas[i]) * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
             Vec4::select(doubled.cmpgt(Vec4::ZERO), change, Vec4::ZERO)
         });
-        // In an order of our own: the same on every machine.
-        let [a, b, c, d] = (of_four[0] + of_four[1]).to_array();
-        0.25 * f64::from((a + b) + (c + d))
+        0.25 * f64::from(in_order(of_four[0] + of_four[1]))
     }
 }

@@ -8,6 +8,7 @@
 
 use super::Vertex;
 use super::metric::turn;
+use super::narrow::{self, Bounds, WIDE};
 use diamantina_protocol::NODATA;
 
 /// Samples of a rectangle of the lattice, one cell apart.
@@ -86,13 +87,8 @@ impl Ground<'_> {
 
     /// Likewise, given twice its area.
     fn distance_in(&self, [a, b, c]: [Vertex; 3], doubled: i64, limit: f64) -> f64 {
-        // Seven of ten are such: halves and thirds part them into least ones.
-        if doubled == 2 {
-            return self.distance_halfway([a, b, c]);
-        }
-        if matches!(doubled, 3 | 4 | 6 | 8) {
-            let scaled = |v: Vertex| Place { x: v.x, y: v.y, height: doubled * i64::from(v.height) };
-            return self.away_in([scaled(a), scaled(b), scaled(c)], doubled, doubled) as f64 / doubled as f64;
+        if let Some(distance) = self.distance_nearby([a, b, c], doubled) {
+            return distance;
         }
         let step = |w: u32, o: u32| w.wrapping_sub(o).cast_signed();
         let local = |v: Vertex| [step(v.x, self.origin[0]), step(v.y, self.origin[1])];
@@ -116,52 +112,24 @@ impl Ground<'_> {
         worst / doubled
     }
 
-    /// Likewise of a triangle that has one other lattice point: in the middle of a side.
-    fn distance_halfway(&self, [a, b, c]: [Vertex; 3]) -> f64 {
-        let is_whole = |p: Vertex, q: Vertex| ((p.x ^ q.x) | (p.y ^ q.y)) & 1 == 0;
-        let (p, q) = if is_whole(a, b) {
-            (a, b)
-        } else if is_whole(b, c) {
-            (b, c)
-        } else {
-            (c, a)
-        };
-        let middle = Vertex { x: (p.x + q.x) / 2, y: (p.y + q.y) / 2, height: 0 };
-        self.sample(middle).map_or(0.0, |h| 0.5 * f64::from((2 * h - p.height - q.height).abs()))
-    }
-
-    /// The largest distance of the samples of a triangle whose `area`, twice the one in plan, is even or 3 or 1, and half
-    /// of it likewise. Heights are those of a plane, times `scale`; so is what is found.
-    fn away_in(&self, [a, b, c]: [Place; 3], area: i64, scale: i64) -> i64 {
-        let edges = [[a, b, c], [b, c, a], [c, a, b]];
-        match area {
-            // No other lattice point has room.
-            1 => 0,
-            3 => match edges.into_iter().find(|[p, q, _]| p.parts(*q, 3)) {
-                Some([p, q, _]) => {
-                    self.away(Place::third(p, p, q), scale).max(self.away(Place::third(p, q, q), scale))
-                }
-                None => self.away(Place::third(a, b, c), scale),
-            },
-            // By Pick's theorem the lattice points on the border are even in number, so some edge has one in its middle.
-            _ => {
-                let Some([p, q, r]) = edges.into_iter().find(|[p, q, _]| p.parts(*q, 2)) else { return 0 };
-                let middle =
-                    Place { x: (p.x + q.x) / 2, y: (p.y + q.y) / 2, height: (p.height + q.height) / 2 };
-                let here = self.away(middle, scale);
-                if area == 2 {
-                    return here;
-                }
-                let halves = [[p, middle, r], [middle, q, r]];
-                halves.map(|half| self.away_in(half, area / 2, scale)).into_iter().fold(here, i64::max)
-            }
+    /// Likewise of a triangle few cells wide, all samples around which lie in the rectangle; `None` of others.
+    #[inline(always)]
+    fn distance_nearby(&self, corners: [Vertex; 3], doubled: i64) -> Option<f64> {
+        let around = Bounds::around(corners)?;
+        // So many columns are looked at.
+        let most = if around.columns <= WIDE / 2 { WIDE / 2 } else { WIDE };
+        let (i, j) = (around.low[0].checked_sub(self.origin[0])?, around.low[1].checked_sub(self.origin[1])?);
+        let from = i.min((self.width as u32).checked_sub(most)?);
+        if i + around.columns > self.width as u32 {
+            return None;
         }
-    }
-
-    /// How far the sample at a place is from its height, times `scale`.
-    fn away(&self, at: Place, scale: i64) -> i64 {
-        let sample = self.sample(Vertex { x: at.x, y: at.y, height: 0 });
-        sample.map_or(0, |h| (scale * i64::from(h) - at.height).abs())
+        let heights = self.heights.get(j as usize * self.width + from as usize..)?;
+        let worst = if most == WIDE {
+            narrow::distance::<2>(corners, doubled as f32, &around, i - from, heights, self.width)
+        } else {
+            narrow::distance::<1>(corners, doubled as f32, &around, i - from, heights, self.width)
+        };
+        Some(f64::from(worst?) / doubled as f64)
     }
 
     /// The largest distance of a triangle's samples, times D; or something above `limit`. Whether samples without height are
@@ -238,27 +206,6 @@ const SAMPLES_BETWEEN: usize = 64;
 
 /// Twice as far as any two heights are apart is less than this, in quanta; from what stands for none it is more.
 const NODATA_AWAY: f64 = (1u32 << 30) as f64;
-
-/// A point of the lattice with the height of a plane, scaled so that it is whole.
-#[derive(Clone, Copy)]
-struct Place {
-    x: u32,
-    y: u32,
-    height: i64,
-}
-
-impl Place {
-    /// Whether points of the lattice part the way to another place into so many.
-    fn parts(self, to: Self, count: u32) -> bool {
-        self.x.abs_diff(to.x).is_multiple_of(count) && self.y.abs_diff(to.y).is_multiple_of(count)
-    }
-
-    /// The middle of three.
-    fn third(a: Self, b: Self, c: Self) -> Self {
-        let height = (a.height + b.height + c.height) / 3;
-        Self { x: (a.x + b.x + c.x) / 3, y: (a.y + b.y + c.y) / 3, height }
-    }
-}
 
 /// A triangle's plane: at column i of row j its height is (start + east * i + north * j) / doubled.
 struct Plane {

@@ -22,7 +22,7 @@
 //! length of the edge that is moved along: an area, as the others are.
 
 use super::fan::Fan;
-use super::mesh::{Mesh, NONE, Star, triangle};
+use super::mesh::{Mesh, Star};
 use super::{Metric, Scale, Vertex};
 
 pub(super) type Vector = [f64; 3];
@@ -90,8 +90,6 @@ impl Quadric {
 pub(super) struct Costs {
     scale: Scale,
     lambda: f64,
-    /// Area vectors and areas of the triangles.
-    vectors: Vec<(Vector, f64)>,
     /// Of the vertices, for the metric that wants them.
     quadrics: Vec<Quadric>,
     origin: Vertex,
@@ -99,12 +97,8 @@ pub(super) struct Costs {
 
 impl Costs {
     pub(super) fn new(mesh: &Mesh, metric: Metric, lambda: f64, scale: Scale) -> Self {
-        let corner = |v: u32| mesh.points[v as usize];
-        // A mesh that is new has all its triangles.
-        let mut vectors = Vec::with_capacity(mesh.live);
-        vectors.extend(mesh.triangles().map(|(_, t)| with_length(area_vector(&scale, t.map(corner)))));
         let origin = mesh.points.first().copied().unwrap_or_default();
-        let mut costs = Self { scale, lambda, vectors, quadrics: Vec::new(), origin };
+        let mut costs = Self { scale, lambda, quadrics: Vec::new(), origin };
         if metric == Metric::Quadric {
             costs.quadrics = costs.all_quadrics(mesh);
         }
@@ -114,8 +108,10 @@ impl Costs {
     fn all_quadrics(&self, mesh: &Mesh) -> Vec<Quadric> {
         let at = |v: u32| between(&self.scale, self.origin, mesh.points[v as usize]);
         let mut quadrics = vec![Quadric::default(); mesh.points.len()];
-        for ((_, t), (vector, area)) in mesh.triangles().zip(&self.vectors) {
-            let plane = Quadric::plane(vector.map(|w| w / area), at(t[0]), *area / 3.0);
+        for (_, t) in mesh.triangles() {
+            let vector = area_vector(&self.scale, t.map(|v| mesh.points[v as usize]));
+            let area = length(vector);
+            let plane = Quadric::plane(vector.map(|w| w / area), at(t[0]), area / 3.0);
             for v in t {
                 quadrics[v as usize].add(&plane);
             }
@@ -133,25 +129,15 @@ impl Costs {
         quadrics
     }
 
-    /// What a star's centre is worth: those of the least go first. And whether its surroundings are a plane, so that
-    /// nothing is lost with it.
-    pub(super) fn importance(&self, mesh: &Mesh, star: &Star) -> (f64, bool) {
-        let (mut areas, mut sum) = (0.0, [0.0; 3]);
-        for spoke in star.spokes() {
-            let (vector, area) = self.vectors[triangle(*spoke)];
-            areas += area;
-            sum = [sum[0] + vector[0], sum[1] + vector[1], sum[2] + vector[2]];
-        }
+    /// What a star's centre is worth, as the fan has just looked at it: those of the least go first. And whether its surroundings
+    /// are a plane, so that nothing is lost with it.
+    pub(super) fn importance(&self, mesh: &Mesh, star: &Star, fan: &mut Fan) -> (f64, bool) {
         let border = star.border;
-        let varies = areas - length(sum);
-        if !border && self.quadrics.is_empty() {
-            return (varies, varies <= FLAT * areas);
-        }
-        let bend =
-            if border { self.lambda * self.bend(mesh, star, 0).min(self.bend(mesh, star, 1)) } else { 0.0 };
-        let flat = varies <= FLAT * areas && bend <= FLAT * areas;
+        let bend = || self.bend(mesh, star, 0).min(self.bend(mesh, star, 1));
+        let flat = is_plane(mesh, star) && !(border && self.lambda * bend() > 0.0);
         if self.quadrics.is_empty() {
-            return (varies + bend, flat);
+            let varies = fan.importance(&self.scale);
+            return (if border { varies + self.lambda * bend() } else { varies }, flat);
         }
         // The least of what the ways out of here cost.
         let ways = (0..star.rim().len()).filter(|to| !border || *to == 0 || *to + 1 == star.rim().len());
@@ -163,7 +149,7 @@ impl Costs {
         if !self.quadrics.is_empty() {
             return self.quadric(mesh, star, to);
         }
-        let changes = fan.cost(&self.scale, to, |i| self.vectors[triangle(star.spokes()[i])]);
+        let changes = fan.cost(&self.scale, to);
         if star.border {
             return changes + self.lambda * self.bend(mesh, star, usize::from(to > 0));
         }
@@ -189,26 +175,24 @@ impl Costs {
     }
 
     /// Follows a collapse that has been done.
-    pub(super) fn follow(&mut self, mesh: &Mesh, star: &Star, to: usize) {
-        let u = star.rim()[to];
+    pub(super) fn follow(&mut self, star: &Star, to: usize) {
         if !self.quadrics.is_empty() {
             let gone = self.quadrics[star.centre as usize];
-            self.quadrics[u as usize].add(&gone);
-        }
-        for spoke in star.spokes() {
-            let t = triangle(*spoke);
-            let corners = mesh.corners(t);
-            if corners[0] != NONE {
-                let points = corners.map(|v| mesh.points[v as usize]);
-                self.vectors[t] = with_length(area_vector(&self.scale, points));
-            }
+            self.quadrics[star.rim()[to] as usize].add(&gone);
         }
     }
 }
 
-/// A share of an area that is nothing but rounding.
-const FLAT: f64 = 1e-12;
-
-fn with_length(vector: Vector) -> (Vector, f64) {
-    (vector, length(vector))
+/// Whether all triangles of a star lie in one plane.
+fn is_plane(mesh: &Mesh, star: &Star) -> bool {
+    let centre = mesh.points[star.centre as usize];
+    let step = |a: u32, b: u32| i64::from(b.wrapping_sub(a).cast_signed());
+    let mut steps = star.rim().iter().map(|v| {
+        let v = &mesh.points[*v as usize];
+        [step(centre.x, v.x), step(centre.y, v.y), i64::from(v.height) - i64::from(centre.height)]
+    });
+    let (Some(a), Some(b)) = (steps.next(), steps.next()) else { return true };
+    let normal = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+    let along = |step: [i64; 3]| (0..3).map(|i| i128::from(normal[i]) * i128::from(step[i])).sum::<i128>();
+    steps.all(|step| along(step) == 0)
 }

@@ -24,6 +24,7 @@ mod few;
 mod ground;
 mod mesh;
 mod metric;
+mod narrow;
 mod patch;
 mod square;
 mod state;

@@ -2,11 +2,11 @@
 
 use super::collapse::{Before, Passed, Simplifier, Until, distance_to};
 use super::ground::Ground;
-use super::mesh::{Mesh, NONE, Star, triangle};
-use super::metric::{Costs, between, length, turn};
+use super::mesh::{Mesh, NONE, triangle};
+use super::metric::{between, length, turn};
 use super::square::{Role, Square};
 use super::state::at_least;
-use super::{Metric, Rules, Vertex};
+use super::{Rules, Vertex};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Diamond;
@@ -214,7 +214,7 @@ pub fn simplify(forest: &Forest, d: Diamond, merged: &Merged, rules: &Rules, unt
         return Simplified::default();
     }
     let square = square(forest, d);
-    let is_lossless = |ground: &Ground<'_>| merged.is_source && keeps(forest, d, *ground, rules);
+    let is_lossless = |ground: &Ground<'_>| merged.is_source && keeps(forest, d, *ground);
     let mut simplified = if matches!(&until, Until::Error { ground, vertical: 0.0, .. } if is_lossless(ground))
     {
         // Nothing is lost, and nothing is known of what any vertex needs.
@@ -297,7 +297,7 @@ fn points(forest: &Forest, d: Diamond, square: Square) -> impl Iterator<Item = [
 }
 
 /// Whether the source's own mesh of a diamond is left as it is where nothing may be lost.
-fn keeps(forest: &Forest, d: Diamond, ground: Ground<'_>, rules: &Rules) -> bool {
+fn keeps(forest: &Forest, d: Diamond, ground: Ground<'_>) -> bool {
     let square = square(forest, d);
     let [low, high] = forest.bounds(d);
     let (mut all, mut flat) = (0, 0);
@@ -311,19 +311,19 @@ fn keeps(forest: &Forest, d: Diamond, ground: Ground<'_>, rules: &Rules) -> bool
         let is_inner = (low[0] < x && x < high[0]) && (low[1] < y && y < high[1]);
         flat += usize::from(is_inner && ground.may_be_plane(Vertex { x, y, height }));
     }
-    square.upper.is_some() && (flat <= all / FLAT_SHARE || stays(forest, d, ground, rules))
+    square.upper.is_some() && (flat <= all / FLAT_SHARE || stays(forest, d, ground))
 }
 
 /// Whether it is sure that nothing goes of the source's own mesh of a diamond, where nothing may be lost: it is a whole
 /// square, there is no gap, and no vertex has flat surroundings.
-fn stays(forest: &Forest, d: Diamond, ground: Ground<'_>, rules: &Rules) -> bool {
+fn stays(forest: &Forest, d: Diamond, ground: Ground<'_>) -> bool {
     let square = square(forest, d);
     let vertices = || points(forest, d, square).map(|[x, y]| Vertex { x, y, height: ground.at(x, y) });
     let may_go = |v: &Vertex| ground.may_be_plane(*v) && square.role(*v) != Role::Locked;
     // First without any gap: surroundings are of heights.
     square.upper.is_some()
         && vertices().all(|v| v.height != NODATA)
-        && !vertices().filter(may_go).any(|v| is_flat(v, ground, rules))
+        && !vertices().filter(may_go).any(|v| is_flat(v, ground))
 }
 
 /// The mesh of a diamond all of whose children have the source's own, if that is left as it is where nothing may be lost.
@@ -333,12 +333,11 @@ pub fn lattice(
     forest: &Forest,
     d: Diamond,
     ground: Ground<'_>,
-    rules: &Rules,
     known: &mut HashMap<Diamond, bool>,
     lattices: &mut Lattices,
 ) -> Option<Merged> {
     for child in forest.children(d).into_iter().flatten() {
-        if !*known.entry(child).or_insert_with(|| keeps(forest, child, ground, rules)) {
+        if !*known.entry(child).or_insert_with(|| keeps(forest, child, ground)) {
             return None;
         }
     }
@@ -355,25 +354,15 @@ pub fn lattice(
     })
 }
 
-/// Whether the surroundings of a vertex of the source's mesh are a plane: as [`Costs`] would say it of the whole mesh, to
-/// the last bit.
-fn is_flat(v: Vertex, ground: Ground<'_>, rules: &Rules) -> bool {
-    let (mut points, mut triangles) = (Vec::new(), Vec::new());
-    let cells = [[1, 1], [0, 1], [1, 0], [0, 0]].map(|[west, south]| halves_of_cell(v.x - west, v.y - south));
-    for corners in cells.as_flattened().iter().filter(|corners| corners.contains(&[v.x, v.y])) {
-        triangles.push(corners.map(|[x, y]| {
-            let is_it = |point: &Vertex| [point.x, point.y] == [x, y];
-            let number = points.iter().position(is_it).unwrap_or_else(|| {
-                points.push(Vertex { x, y, height: ground.at(x, y) });
-                points.len() - 1
-            });
-            u32::try_from(number).unwrap_or(NONE)
-        }));
-    }
-    let (mesh, mut star) = (Mesh::new(&points, &triangles), Star::default());
-    let Some(centre) = points.iter().position(|point| *point == v) else { return true };
-    mesh.look(u32::try_from(centre).unwrap_or(NONE), &mut star);
-    Costs::new(&mesh, Metric::Normal, rules.lambda, rules.scale).importance(&mesh, &star).1
+/// Whether the surroundings of a vertex of the source's mesh are a plane, given that they [may be](Ground::may_be_plane) and
+/// have heights.
+fn is_flat(v: Vertex, ground: Ground<'_>) -> bool {
+    let rise = |x: i32, y: i32| ground.at(v.x.wrapping_add_signed(x), v.y.wrapping_add_signed(y)) - v.height;
+    let slopes = [rise(1, 0), rise(0, 1)];
+    let goes_on = |x: i32, y: i32| rise(x, y) == slopes[0] * x + slopes[1] * y;
+    // Diagonals meet in every second vertex.
+    let has_diagonals = (v.x + v.y).is_multiple_of(2);
+    !has_diagonals || [-1, 1].into_iter().all(|x| goes_on(x, -1) && goes_on(x, 1))
 }
 
 /// How far samples are from each triangle, in quanta: measured where that is asked and not known.
@@ -495,8 +484,8 @@ fn cut(
 
 #[cfg(test)]
 mod tests {
-    use super::super::Scale;
     use super::super::tests::Field;
+    use super::super::{Metric, Scale};
     use super::*;
     use proptest::prelude::*;
 
@@ -520,7 +509,7 @@ mod tests {
             for d in (1..=forest.levels()).flat_map(|level| forest.diamonds(level)) {
                 let merged = source(&forest, d, field.ground());
                 let square = square(&forest, d);
-                if stays(&forest, d, field.ground(), &rules) {
+                if stays(&forest, d, field.ground()) {
                     let expected = collapsed(&merged, square, &rules, until);
                     prop_assert_eq!(simplify(&forest, d, &merged, &rules, until), expected);
                 }

@@ -18,8 +18,6 @@ pub(super) enum Around {
 pub(super) struct State {
     /// How important it is.
     pub(super) key: f32,
-    /// It cannot go under any limit below this: known once it has been tried.
-    pub(super) needed: f32,
     /// Whether nothing is lost with it.
     pub(super) flat: bool,
     /// Whether both are known.
@@ -31,7 +29,7 @@ pub(super) struct State {
 impl State {
     /// Of a vertex that nothing is known of but where it lies.
     pub(super) fn new(role: Role) -> Self {
-        Self { key: 0.0, needed: 0.0, flat: false, is_known: false, role, around: Around::Whole }
+        Self { key: 0.0, flat: false, is_known: false, role, around: Around::Whole }
     }
 
     /// Numbers that sort as the keys do, none of which is negative, and of equal keys as the vertices: so that the order
@@ -54,6 +52,13 @@ pub(super) fn at_least(value: f64) -> f32 {
     if f64::from(short) < value { short.next_up() } else { short }
 }
 
+/// A number that is not negative, without the last bits: so that what is equal but for rounding is equal, and goes in the
+/// order of its places.
+#[allow(clippy::cast_possible_truncation, reason = "an order need not be precise")]
+pub(super) fn rounded(value: f64) -> f32 {
+    f32::from_bits(((value as f32).to_bits() + 0x80) & !0xff)
+}
+
 /// The upper half of a number that is not negative: as much or a little less.
 #[allow(clippy::cast_possible_truncation, reason = "the upper half")]
 pub(super) fn shortened(value: f32) -> u16 {
@@ -63,6 +68,13 @@ pub(super) fn shortened(value: f32) -> u16 {
 /// What [`shortened`] made.
 pub(super) fn unshortened(short: u16) -> f32 {
     f32::from_bits(u32::from(short) << 16)
+}
+
+/// The largest short number that is no more.
+#[allow(clippy::cast_possible_truncation, reason = "rounded, and then made smaller where that was to larger")]
+pub(super) fn at_most(value: f64) -> f32 {
+    let short = value as f32;
+    if f64::from(short) > value { short.next_down() } else { short }
 }
 
 /// The next smaller number that is short.

@@ -200,7 +200,7 @@ impl Tins<'_> {
 
     /// The mesh of a diamond of the finest payloads if it is the source's own.
     fn whole(&self, deep: &Forest, d: Diamond, ground: Ground<'_>, finest: &mut Finest) -> Option<Merged> {
-        lattice(deep, d, ground, &self.rules(), &mut finest.keep, &mut finest.lattices)
+        lattice(deep, d, ground, &mut finest.keep, &mut finest.lattices)
     }
 
     /// The mesh of a diamond whose children are the first to be simplified.
