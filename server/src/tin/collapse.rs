@@ -516,8 +516,20 @@ impl<'a> Simplifier<'a> {
         let mut needed = f64::INFINITY;
         self.fan.measure();
         // Opposite ways out of four leave the same two triangles.
-        let ways = if star.rim().len() == 4 && !star.border && !along { 2 } else { star.rim().len() };
-        for to in 0..ways {
+        let is_twice = star.rim().len() == 4 && !star.border && !along;
+        let within = if along { None } else { self.fan.within(at_most(limit).min(f32::MAX)) };
+        if let Some((mut ways, least)) = within {
+            needed = least;
+            if is_twice {
+                ways &= 0b11;
+            }
+            while ways != 0 {
+                self.ways.push((0.0, ways.trailing_zeros() as usize));
+                ways &= ways - 1;
+            }
+        }
+        let rest = if within.is_some() { 0 } else { star.rim().len() };
+        for to in 0..if is_twice { rest.min(2) } else { rest } {
             let is_end = to == 0 || to + 1 == star.rim().len();
             if star.border && !is_end {
                 continue;
@@ -558,11 +570,13 @@ impl<'a> Simplifier<'a> {
         let u = star.rim()[to];
         let point = |v: u32| self.mesh.points[v as usize];
         let mut most = 0.0f64;
-        for i in 0..star.spokes().len() {
+        // All but those two that the way is a side of.
+        let (count, last) = (star.spokes().len(), star.rim().len() - 1);
+        let (first, rest) = if star.border { (usize::from(to == 0), count - 1) } else { (to + 1, count - 2) };
+        // Those far from the way, where most samples are, come first.
+        for i in (first + rest / 2..first + rest).chain(first..first + rest / 2) {
+            let i = if i > last { i - last - 1 } else { i };
             let [p, q] = star.edge(i);
-            if p == u || q == u {
-                continue;
-            }
             let distance = ground.distance_within([point(u), point(p), point(q)], *vertical);
             most = most.max(distance);
             if most > *vertical {

@@ -52,7 +52,7 @@ impl Fan {
         (self.count, self.border) = (rim.len(), star.border);
         self.is_few = self.is_near && !self.border && self.count <= FEW;
         if self.is_few {
-            return self.few.look(centre, &mesh.points, rim);
+            return self.few.look(centre, &mesh.points, star.few(), self.count);
         }
         self.steps.clear();
         self.steps.extend(rim.iter().map(|v| {
@@ -134,6 +134,12 @@ impl Fan {
             least = self.off(to, |off| off < least).unwrap_or(least);
         }
         least
+    }
+
+    /// The ways on which the centre's own sample will be no farther off than a limit, as bits, and what the others are at least;
+    /// `None` if there may be more ways than bits, or the centre may not go any way.
+    pub(super) fn within(&self, limit: f32) -> Option<(u32, f64)> {
+        self.is_few.then(|| self.few.within(limit))
     }
 
     /// Of a cross product of steps in the lattice's units, half of one in metres.

@@ -24,9 +24,8 @@ type Eight = [Vec4; 2];
 #[derive(Debug, Default)]
 pub(super) struct Few {
     count: usize,
-    /// The vertices, and those that follow them. Behind the last one comes the first one again and again.
-    here: [[f32; FEW]; 3],
-    after: [[f32; FEW]; 3],
+    /// The vertices. Behind the last one comes the first one again and again.
+    steps: [[f32; FEW + 1]; 3],
     /// How far the centre's own sample will be from the surface at least, by ways; infinite where there is no way.
     offs: [f32; FEW],
     /// Of the triangles that follow the vertices the edges, back to the vertices; twice the area vectors, in cells and
@@ -42,9 +41,12 @@ fn each<T>(of: impl Fn(usize) -> T) -> [T; 2] {
     [of(0), of(1)]
 }
 
-fn eight(numbers: &[f32; FEW]) -> Eight {
-    let [a, b, c, d, e, f, g, h] = *numbers;
-    [Vec4::new(a, b, c, d), Vec4::new(e, f, g, h)]
+/// Eight numbers from the first or the second on.
+fn eight(numbers: &[f32; FEW + 1], from: usize) -> Eight {
+    each(|four| {
+        let at = from % 2 + 4 * four;
+        Vec4::new(numbers[at], numbers[at + 1], numbers[at + 2], numbers[at + 3])
+    })
 }
 
 fn length([a, b, c]: [Vec4; 3]) -> Vec4 {
@@ -58,23 +60,29 @@ fn in_order(four: Vec4) -> f32 {
 }
 
 impl Few {
-    /// Takes over the vertices around a centre, [`FEW`] at most.
+    /// Takes over so many vertices around a centre, behind which the first one comes again and again.
     #[allow(clippy::cast_precision_loss, reason = "below 2^24, but for heights, whose rounding is counted")]
-    pub(super) fn look(&mut self, centre: Vertex, points: &[Vertex], rim: &[u32]) {
+    pub(super) fn look(&mut self, centre: Vertex, points: &[Vertex], rim: &[u32; FEW], count: usize) {
         let step = |a: u32, b: u32| b.wrapping_sub(a).cast_signed() as f32;
-        let steps = |v: &u32| {
+        self.count = count;
+        for (i, v) in rim.iter().enumerate() {
             let v = &points[*v as usize];
-            [step(centre.x, v.x), step(centre.y, v.y), (v.height - centre.height) as f32]
-        };
-        let Some((first, rest)) = rim.split_first() else { return };
-        let first = steps(first);
-        self.count = rim.len();
-        (self.here, self.after) = (first.map(|w| [w; FEW]), first.map(|w| [w; FEW]));
-        for (i, v) in (1..FEW).zip(rest) {
-            for ((here, after), w) in self.here.iter_mut().zip(&mut self.after).zip(steps(v)) {
-                (here[i], after[i - 1]) = (w, w);
-            }
+            self.steps[0][i] = step(centre.x, v.x);
+            self.steps[1][i] = step(centre.y, v.y);
+            self.steps[2][i] = (v.height - centre.height) as f32;
         }
+        for steps in &mut self.steps {
+            steps[FEW] = steps[0];
+        }
+    }
+
+    /// The vertices, and those that follow them.
+    fn here(&self) -> [Eight; 3] {
+        self.steps.each_ref().map(|steps| eight(steps, 0))
+    }
+
+    fn after(&self) -> [Eight; 3] {
+        self.steps.each_ref().map(|steps| eight(steps, 1))
     }
 
     /// Finds out how far off the centre's own sample will be, whichever way it goes. Of each triangle all ways are looked at
@@ -85,10 +93,10 @@ impl Few {
 
     #[inline(always)]
     fn measure_ways<const FOURS: usize>(&mut self) {
-        let ways = self.here.each_ref().map(eight);
+        let ways = self.here();
         let [u_x, u_y, u_z] = ways.each_ref().map(|w| &w[..FOURS]);
         let with = |i: usize| -> [Vec4; FOURS] {
-            let (x, y) = (Vec4::splat(self.here[0][i % FEW]), Vec4::splat(self.here[1][i % FEW]));
+            let (x, y) = (Vec4::splat(self.steps[0][i]), Vec4::splat(self.steps[1][i]));
             std::array::from_fn(|k| u_x[k] * y - u_y[k] * x)
         };
         let (mut height, mut area) = ([Vec4::ZERO; FOURS], [Vec4::ONE; FOURS]);
@@ -96,9 +104,9 @@ impl Few {
         let mut remaining = [Vec4::ZERO; FOURS];
         let mut from = with(0);
         for i in 0..self.count.min(FEW) {
-            let until = if i + 1 == self.count { with(0) } else { with(i + 1) };
-            let [x, y, z] = self.here.each_ref().map(|w| w[i]);
-            let [next_x, next_y, next_z] = self.after.each_ref().map(|w| w[i]);
+            let until = with(i + 1);
+            let [x, y, z] = self.steps.each_ref().map(|w| w[i]);
+            let [next_x, next_y, next_z] = self.steps.each_ref().map(|w| w[i + 1]);
             let turn = Vec4::splat(x * next_y - y * next_x);
             let (z, next_z) = (Vec4::splat(z), Vec4::splat(next_z));
             for k in 0..FOURS {
@@ -134,12 +142,22 @@ impl Few {
         self.offs[..self.count.min(FEW)].iter().copied().fold(f32::INFINITY, f32::min).into()
     }
 
+    /// Which ways [`Few::measure`] has found to be no farther off than a limit, as bits, and the least of the others.
+    pub(super) fn within(&self, limit: f32) -> (u32, f64) {
+        let (mut ways, mut least) = (0, f32::INFINITY);
+        for (to, off) in self.offs.iter().enumerate() {
+            let is_within = *off <= limit;
+            ways |= u32::from(is_within) << to;
+            least = least.min(if is_within { f32::INFINITY } else { *off });
+        }
+        (ways & !(u32::MAX << self.count), least.into())
+    }
+
     /// Prepares [`Few::cost`], given what the components of cross products have to be scaled by to be area vectors.
     #[allow(clippy::cast_possible_truncation, reason = "an order need not be precise")]
     pub(super) fn prepare(&mut self, metres: Vector) {
         self.metres = metres.map(|w| w as f32);
-        let [x, y, z] = self.here.each_ref().map(eight);
-        let [next_x, next_y, next_z] = self.after.each_ref().map(eight);
+        let ([x, y, z], [next_x, next_y, next_z]) = (self.here(), self.after());
         self.edges = [each(|i| x[i] - next_x[i]), each(|i| y[i] - next_y[i]), each(|i| z[i] - next_z[i])];
         self.vectors = [
             each(|i| y[i] * next_z[i] - z[i] * next_y[i]),
@@ -176,7 +194,7 @@ impl Few {
     /// How much the normals of the triangles that survive change if the centre slides into a vertex: where normals differ
     /// by d, 1 - n . n' is d^2 / 2.
     pub(super) fn cost(&self, to: usize) -> f64 {
-        let [u_x, u_y, u_z] = [0, 1, 2].map(|k| Vec4::splat(self.here[k][to % FEW]));
+        let [u_x, u_y, u_z] = [0, 1, 2].map(|k| Vec4::splat(self.steps[k][to % FEW]));
         let [x, y, z] = &self.edges;
         let of_four = each(|i| {
             let [old_x, old_y, old_z] = [0, 1, 2].map(|k| self.vectors[k][i]);

@@ -87,6 +87,9 @@ impl Ground<'_> {
 
     /// Likewise, given twice its area.
     fn distance_in(&self, [a, b, c]: [Vertex; 3], doubled: i64, limit: f64) -> f64 {
+        if doubled == 2 {
+            return self.distance_halfway([a, b, c]);
+        }
         if let Some(distance) = self.distance_nearby([a, b, c], doubled) {
             return distance;
         }
@@ -110,6 +113,17 @@ impl Ground<'_> {
             return self.worst::<true>(&plane, &sides, limit * doubled) / doubled;
         }
         worst / doubled
+    }
+
+    /// Likewise of a triangle that has one other lattice point: in the middle of a side.
+    fn distance_halfway(&self, corners: [Vertex; 3]) -> f64 {
+        let [a, b, c] = corners;
+        let has_none = |p: Vertex, q: Vertex| ((p.x ^ q.x) | (p.y ^ q.y)) & 1;
+        // Without a choice: which one it is is as random as the mesh.
+        let side = (has_none(a, b) + (has_none(a, b) & has_none(b, c))) as usize;
+        let (p, q) = (corners[side % 3], corners[(side + 1) % 3]);
+        let middle = Vertex { x: (p.x + q.x) / 2, y: (p.y + q.y) / 2, height: 0 };
+        self.sample(middle).map_or(0.0, |h| 0.5 * f64::from((2 * h - p.height - q.height).abs()))
     }
 
     /// Likewise of a triangle few cells wide, all samples around which lie in the rectangle; `None` of others.

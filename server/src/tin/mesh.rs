@@ -17,6 +17,7 @@
 //! Where triangles touch in a point alone (nodata may leave such), that point is a vertex for each fan of them.
 
 use super::Vertex;
+use super::few::FEW;
 use diamantina_protocol::tin::Neighbours;
 
 /// No half-edge, vertex or triangle.
@@ -100,7 +101,7 @@ impl Star {
 
     #[cold]
     fn grow(&mut self) {
-        let count = (2 * self.spokes.len()).max(16);
+        let count = (2 * self.spokes.len()).max(4 * FEW);
         self.spokes.resize(count, NONE);
         self.rim.resize(count, NONE);
     }
@@ -108,6 +109,11 @@ impl Star {
     /// The vertices around, counterclockwise: one a spoke, and one more at a border.
     pub(super) fn rim(&self) -> &[u32] {
         &self.rim[..self.count + usize::from(self.border)]
+    }
+
+    /// The rim of a whole star, or its first part; behind the last vertex comes the first one again and again.
+    pub(super) fn few(&self) -> &[u32; FEW] {
+        self.rim.first_chunk().unwrap_or(&[NONE; FEW])
     }
 
     /// The rim's edge opposite of the centre in triangle `i`.
@@ -228,8 +234,8 @@ impl Mesh {
             // Of corner 0, 1 and 2 two bits each: the corners after and before.
             let twice = 2 * (h & 3);
             let (to, from) = (four[0b00_10_01 >> twice & 3], four[0b01_00_10 >> twice & 3]);
-            // Room for one more, for a border.
-            if count + 1 >= star.spokes.len().min(star.rim.len()) {
+            // Room for those behind.
+            if count + FEW >= star.spokes.len().min(star.rim.len()) {
                 star.grow();
             }
             (star.spokes[count], star.rim[count]) = (h, to.origin);
@@ -243,6 +249,10 @@ impl Mesh {
                 break false;
             }
         };
+        if !star.border {
+            let first = star.rim[0];
+            star.rim[count..count + FEW].fill(first);
+        }
         star.count = count;
     }
 
