@@ -275,7 +275,7 @@ pub(crate) struct Proxy {
 
 impl Proxy {
     /// Starts a proxy, whose threads end with the process. The first connection, which reads the scene's
-    /// description, is left alone but for that.
+    /// description, is neither cut nor silent before that has come; clients may ask for all the rest over it, too.
     pub(crate) fn start(upstream: &str, faults: Faults, seed: u64) -> Self {
         let upstream = upstream.strip_prefix("http://").unwrap().to_owned();
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -292,25 +292,29 @@ impl Proxy {
                 });
                 let done = Arc::clone(&done);
                 let dice = Dice(seed ^ (number as u64) << 20);
-                std::thread::spawn(move || pump(server, client, faults, dice, number > 0, &done));
+                let spared = if number == 0 { DESCRIPTION_BYTES_MAX } else { 0 };
+                std::thread::spawn(move || pump(server, client, faults, dice, spared, &done));
             }
         });
         Self { address, faults_done }
     }
 }
 
-/// Hands a server's answers to a client, late, in pieces, or not at all.
+/// More than the description of any scene here takes.
+const DESCRIPTION_BYTES_MAX: u64 = 16 << 10;
+
+/// Hands a server's answers to a client, late, in pieces, or not at all; but nothing happens to so many bytes at first.
 fn pump(
     mut from: TcpStream,
     mut to: TcpStream,
     faults: Faults,
     mut dice: Dice,
-    spoil: bool,
+    spared: u64,
     done: &AtomicU64,
 ) {
     // Where in the connection's life something happens to it.
-    let cut_at = (spoil && dice.roll() < faults.cut).then(|| dice.below(60_000));
-    let stall_at = (spoil && dice.roll() < faults.stalled).then(|| dice.below(60_000));
+    let cut_at = (dice.roll() < faults.cut).then(|| spared + dice.below(60_000));
+    let stall_at = (dice.roll() < faults.stalled).then(|| spared + dice.below(60_000));
     let delay = faults.delay.mul_f64(dice.roll());
     let (mut sent, mut stalled) = (0, false);
     let mut buffer = vec![0; 4096];

@@ -31,6 +31,25 @@ pub struct Cache {
     /// Counts cuts. What was used at `now` is wanted by the last one.
     now: u64,
     held: HashMap<Key, Held, RandomState>,
+    asked: Asked,
+}
+
+/// How often a diamond was wanted that the cut before did not want.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
+pub struct Asked {
+    /// It was resident.
+    pub found: u64,
+    /// It had to come first, and did.
+    pub came: u64,
+}
+
+impl Asked {
+    /// The share of those that were resident, 0 to 1; `None` if nothing was wanted yet.
+    #[must_use]
+    pub fn found_share(&self) -> Option<f64> {
+        let all = self.found + self.came;
+        (all > 0).then(|| self.found as f64 / all as f64)
+    }
 }
 
 #[derive(Debug)]
@@ -47,7 +66,8 @@ impl Cache {
     #[must_use]
     pub fn new(forests: Vec<Forest>, budget_bytes: usize) -> Self {
         let keeps_roots = vec![true; forests.len()];
-        Self { forests, budget_bytes, bytes: 0, keeps_roots, now: 1, held: HashMap::default() }
+        let asked = Asked::default();
+        Self { forests, budget_bytes, bytes: 0, keeps_roots, now: 1, held: HashMap::default(), asked }
     }
 
     /// Says whether the roots of a layer stay resident whatever the budget. Those of a layer that is not to be drawn for
@@ -73,6 +93,18 @@ impl Cache {
         self.bytes
     }
 
+    /// The bytes that they may take, but for roots.
+    #[must_use]
+    pub fn budget_bytes(&self) -> usize {
+        self.budget_bytes
+    }
+
+    /// How often what was wanted anew was resident so far.
+    #[must_use]
+    pub fn asked(&self) -> Asked {
+        self.asked
+    }
+
     /// How many surfaces are resident.
     #[must_use]
     pub fn len(&self) -> usize {
@@ -90,6 +122,7 @@ impl Cache {
         self.now += 1;
         for key in keys {
             if let Some(held) = self.held.get_mut(&key) {
+                self.asked.found += u64::from(held.used + 1 < self.now);
                 held.used = self.now;
             }
         }
@@ -120,6 +153,7 @@ impl Cache {
             }
         }
         self.bytes += bytes;
+        self.asked.came += u64::from(wanted);
         let used = if wanted { self.now } else { self.now - 1 };
         self.held.insert(key, Held { surface, used, children: 0 });
         true
@@ -316,6 +350,33 @@ mod tests {
         let child = built.layer.forest.diamonds(1).next().unwrap();
         assert!(!cache.insert((0, child), Arc::clone(&all[&child]), true));
         assert_eq!(cache.len(), 2);
+    }
+
+    #[test]
+    fn what_comes_into_sight_again_is_found_once() {
+        let built = &world()[0];
+        let all = surfaces(built, |d| d.level() < 2);
+        let mut cache = Cache::new(vec![built.layer.forest], usize::MAX);
+        assert_eq!(cache.asked().found_share(), None);
+        let roots: Vec<Diamond> = built.layer.forest.root_diamonds().collect();
+        let want = |cache: &mut Cache, wanted: &[Diamond]| cache.want(wanted.iter().map(|d| (0, *d)));
+        want(&mut cache, &roots);
+        for d in &roots {
+            assert!(cache.insert((0, *d), Arc::clone(&all[d]), true));
+        }
+        assert_eq!(cache.asked(), Asked { found: 0, came: 2 });
+        // As long as they stay in sight nothing is asked for.
+        want(&mut cache, &roots);
+        want(&mut cache, &roots);
+        assert_eq!(cache.asked(), Asked { found: 0, came: 2 });
+        want(&mut cache, &roots[..1]);
+        want(&mut cache, &roots);
+        assert_eq!(cache.asked(), Asked { found: 1, came: 2 });
+        want(&mut cache, &[]);
+        want(&mut cache, &roots);
+        want(&mut cache, &roots);
+        assert_eq!(cache.asked(), Asked { found: 3, came: 2 });
+        assert_eq!(cache.asked().found_share(), Some(0.6));
     }
 
     #[test]

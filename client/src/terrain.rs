@@ -25,7 +25,7 @@ mod shown;
 mod steps;
 mod view;
 
-use crate::cache::{Cache, Index, Key};
+use crate::cache::{Asked, Cache, Index, Key};
 use crate::camera::{Camera, Plane};
 use crate::cut::{self, Ask, Drawing, Gpu, Ideal, Wish};
 use crate::drawing::{DrawItem, Mirror};
@@ -81,6 +81,10 @@ pub struct Stats {
     pub resident: usize,
     /// Bytes of memory that they take.
     pub resident_bytes: usize,
+    /// Bytes that they may take.
+    pub budget_bytes: usize,
+    /// How often diamonds that were wanted anew were resident.
+    pub asked: Asked,
     /// Tiles of imagery in memory.
     pub texture_tiles: usize,
     /// Bytes that they take.
@@ -745,6 +749,8 @@ impl Terrain {
         self.note_traffic();
         self.stats.resident = self.cache.len();
         self.stats.resident_bytes = self.cache.bytes();
+        self.stats.budget_bytes = self.cache.budget_bytes();
+        self.stats.asked = self.cache.asked();
         self.stats.pages = self.layers.iter().map(|state| state.index.pages()).sum();
         self.stats.decoding = self.pending.len();
         self.stats.steps_ahead = self.steps_ahead();

@@ -20,6 +20,7 @@ use diamantina_protocol::message::{
 use diamantina_protocol::points::{self, Coding, Rule};
 use diamantina_protocol::series::Series;
 use diamantina_protocol::sight;
+use diamantina_protocol::texture::Texture;
 use diamantina_protocol::tin::{self, Patch};
 use glam::DVec3;
 use std::collections::{HashMap, HashSet};
@@ -526,8 +527,28 @@ impl Served {
 
     /// As [`Served::start`], where another one was before.
     pub(crate) fn start_at(address: &str, layers: usize, faults: Faults) -> Self {
+        Self::start_with(address, scene(layers), faults)
+    }
+
+    /// Terrain and imagery of it, none of whose tiles there are.
+    pub(crate) fn start_draped() -> Self {
+        let photo = Texture {
+            name: "photo".to_owned(),
+            origin: [0.0, 0.0],
+            texel: [10.0, 10.0],
+            size: [1024, 512],
+            format: "webp".to_owned(),
+            quality: 80,
+            tiles: 0,
+            bytes: 0,
+            resampled: false,
+        };
+        Self::start_with("127.0.0.1:0", Scene { textures: vec![photo], ..scene(1) }, Faults::default())
+    }
+
+    fn start_with(address: &str, scene: Scene, faults: Faults) -> Self {
         let state = Arc::new(Serving {
-            scene: scene(layers),
+            scene,
             faults: Mutex::new(faults),
             requests: AtomicUsize::new(0),
             dice: AtomicU64::new(1),

@@ -325,7 +325,10 @@ fn figures(viewer: &Viewer, ui: &mut Ui) {
     row("diamonds resident", grouped(stats.resident as u64));
     row("received", format!("{:.2} MB", stats.traffic.bytes as f64 / 1e6));
     row("requests", format!("{} in {} round trips", stats.traffic.requests, stats.traffic.round_trips));
-    row("memory", format!("{:.0} MB", stats.resident_bytes as f64 / 1e6));
+    let [resident, budget] = [stats.resident_bytes, stats.budget_bytes].map(|b| b as f64 / 1e6);
+    row("memory", format!("{resident:.0} of {budget:.0} MB"));
+    let share = stats.asked.found_share();
+    row("found in memory", share.map_or("-".to_owned(), |share| format!("{:.0} %", 100.0 * share)));
     if !viewer.terrain.scene().series.is_empty() {
         row("steps fetched ahead", stats.steps_ahead.to_string());
     }

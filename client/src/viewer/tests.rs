@@ -5,7 +5,7 @@ mod panel;
 
 use super::*;
 use crate::fetch;
-use crate::terrain::Options;
+use crate::terrain::{Imagery, Options};
 use crate::world::{Faults, Served, above, world};
 use egui::{Pos2, RawInput, Rect, pos2, vec2};
 use std::time::{Duration, Instant};
@@ -37,9 +37,12 @@ impl Hand {
     }
 
     fn with(layers: usize, look: Look, camera: Option<Camera>) -> Self {
-        let served = Served::start(layers, Faults::default());
-        let terrain =
-            Terrain::open(&served.url, Options { fetch: fetch::Options::default(), ..Options::default() });
+        Self::over(Served::start(layers, Faults::default()), Imagery::First, look, camera)
+    }
+
+    fn over(served: Served, imagery: Imagery, look: Look, camera: Option<Camera>) -> Self {
+        let options = Options { fetch: fetch::Options::default(), imagery, ..Options::default() };
+        let terrain = Terrain::open(&served.url, options);
         let viewer = Viewer::new(terrain.unwrap(), &served.url, look, SIZE, camera.map(view_at));
         let points = vec2(SIZE[0] as f32, SIZE[1] as f32);
         let mut hand = Self { viewer, context: egui::Context::default(), seconds: 0.0, points, served };
@@ -333,6 +336,26 @@ fn the_true_view_is_plain_and_can_be_left_again() {
     let expected = Look { colours: crate::render::Colours::Slope, ..before };
     assert_eq!((*hand.viewer.look(), hand.viewer.terrain.morph_seconds()), (expected, 0.3));
     assert!((hand.camera().eye - eye).length() < 0.01 * (eye - ground).length());
+}
+
+#[test]
+fn the_true_view_leaves_imagery_out() {
+    let camera = Some(looking_down());
+    let mut hand = Hand::over(Served::start_draped(), Imagery::None, Look::default(), camera);
+    let laid = |hand: &Hand| hand.viewer.terrain.texture_name().map(str::to_owned);
+    let photo = Some("photo".to_owned());
+    hand.viewer.terrain.set_texture(Some(0));
+    assert_eq!(laid(&hand), photo);
+    hand.viewer.set_true(true);
+    assert!(hand.viewer.is_true() && laid(&hand).is_none(), "colours tell heights");
+    hand.viewer.set_true(false);
+    assert_eq!(laid(&hand), photo, "as before");
+    // What is asked for in between stays.
+    hand.viewer.terrain.set_texture(None);
+    hand.viewer.set_true(true);
+    hand.viewer.terrain.set_texture(Some(0));
+    hand.viewer.set_true(false);
+    assert_eq!(laid(&hand), photo, "as chosen");
 }
 
 #[test]
