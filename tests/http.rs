@@ -11,7 +11,7 @@ use diamantina_server::store::Store;
 use diamantina_server::{ingest, inspect};
 use reqwest::header::{
     ACCESS_CONTROL_ALLOW_ORIGIN, CACHE_CONTROL, CONTENT_LENGTH, CONTENT_TYPE, ETAG, HeaderMap, HeaderName,
-    IF_NONE_MATCH,
+    IF_MATCH, IF_NONE_MATCH,
 };
 use reqwest::{Method, StatusCode};
 use std::sync::Arc;
@@ -121,6 +121,55 @@ fn immutable_things_say_so_and_answer_304_to_who_has_them() {
             assert_eq!(head.header(&ETAG), tag);
             assert_eq!(head.header(&CONTENT_LENGTH), answer.body.len().to_string());
         }
+    });
+}
+
+/// What is asked for most has a shorter way through the server; an address that is written in another way has not.
+#[test]
+fn both_ways_to_a_diamond_give_the_same_answer() {
+    let site = site();
+    let told = |answer: &Answer| {
+        let mut headers = answer.headers.clone();
+        for name in ["date", "server-timing", "x-request-id"] {
+            assert!(headers.remove(name).is_some(), "{name}");
+        }
+        (answer.status, headers, answer.body.clone())
+    };
+    block(async {
+        let d = site.diamonds[3].0;
+        let url = site.points(d);
+        // From the disk; what follows is kept.
+        let first = get(&url).await;
+        let tag = first.header(&ETAG).to_owned();
+        let [beside, behind, gone] = [
+            url.replace(&d.centre()[0].to_string(), "9999999"),
+            format!("{url}/"),
+            url.replace(&site.version, "0123456789abcdef"),
+        ];
+        let conditions = [
+            vec![],
+            vec![(IF_NONE_MATCH, &*tag)],
+            vec![(IF_NONE_MATCH, "\"a\", *")],
+            vec![(IF_MATCH, "\"a\"")],
+        ];
+        for url in [&url, &beside, &behind, &gone] {
+            let long = url.replace("/scenes/world/", "/scenes/%77orld/");
+            assert_ne!(*url, long);
+            for headers in &conditions {
+                let [short, long] =
+                    [ask(Method::GET, url, headers).await, ask(Method::GET, &long, headers).await];
+                assert_eq!(told(&short), told(&long), "{url} {headers:?}");
+            }
+        }
+        assert_eq!(told(&get(&url).await), told(&first));
+        for (url, status) in [&beside, &behind, &gone].into_iter().zip([404, 404, 410]) {
+            assert_eq!(get(url).await.status.as_u16(), status, "{url}");
+        }
+        let metrics = String::from_utf8(get(&site.url("/metrics")).await.body).unwrap();
+        let line = "diamantina_requests_total{route=\"/scenes/{scene}/{version}/{layer}/points/{x}/{y}\",status=\"200\"}";
+        let count = metrics.lines().find_map(|l| l.strip_prefix(line)).unwrap();
+        // The first, one each way, and the last.
+        assert_eq!(count.trim(), "4", "{metrics}");
     });
 }
 

@@ -164,7 +164,7 @@ impl Blobs {
         if !store.has(key) {
             return Ok(None);
         }
-        if let Some(blob) = self.filed(name(store, key)) {
+        if let Some(blob) = self.at_once(store, key) {
             return Ok(Some(blob));
         }
         let mut at_hand = HashMap::new();
@@ -178,6 +178,11 @@ impl Blobs {
             }
         };
         read.map(|blob| blob.map(Blob::from))
+    }
+
+    /// The blob of a key, if it is kept; it has a copy for the kernel from now on.
+    pub(super) fn at_once(&self, store: &Store, key: Key) -> Option<Blob> {
+        self.filed(name(store, key))
     }
 
     /// Tells the metrics how full the cache is.

@@ -41,6 +41,8 @@ const EXPOSED: &str = "etag, content-length, retry-after, server-timing, x-reque
 const ACCEPTED: &str = "authorization, if-match, if-none-match, x-request-id";
 
 const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
+const SERVER_TIMING: HeaderName = HeaderName::from_static("server-timing");
+const TIMING_ALLOW_ORIGIN: HeaderName = HeaderName::from_static("timing-allow-origin");
 
 /// The routes, and who may get to them.
 pub(super) struct Front {
@@ -111,9 +113,14 @@ impl Front {
             Err(refused) => *refused,
             Ok(place) => {
                 ended.place = place;
-                // The body is empty.
-                let Ok(response) = self.routes.call(request.map(|_| Body::empty())).await;
-                response
+                match routes::at_once(&self.site, &request) {
+                    Some(response) => response,
+                    None => {
+                        // The body is empty.
+                        let Ok(response) = self.routes.call(request.map(|_| Body::empty())).await;
+                        response
+                    }
+                }
             }
         };
         if let Some(Cause(cause)) = response.extensions_mut().remove() {
@@ -205,13 +212,13 @@ fn common_headers(headers: &mut HeaderMap, id: &str, seconds: f64) {
     headers.insert(header::ACCESS_CONTROL_ALLOW_ORIGIN, HeaderValue::from_static("*"));
     headers.insert(header::ACCESS_CONTROL_EXPOSE_HEADERS, HeaderValue::from_static(EXPOSED));
     headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
-    headers.insert(HeaderName::from_static("timing-allow-origin"), HeaderValue::from_static("*"));
+    headers.insert(TIMING_ALLOW_ORIGIN, HeaderValue::from_static("*"));
     // Both are made of what headers may hold.
     if let Ok(id) = HeaderValue::from_str(id) {
         headers.insert(REQUEST_ID, id);
     }
-    if let Ok(timing) = HeaderValue::from_str(&format!("app;dur={:.3}", 1000.0 * seconds)) {
-        headers.insert(HeaderName::from_static("server-timing"), timing);
+    if let Ok(timing) = HeaderValue::try_from(format!("app;dur={:.3}", 1000.0 * seconds)) {
+        headers.insert(SERVER_TIMING, timing);
     }
 }
 
