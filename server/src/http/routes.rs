@@ -455,8 +455,8 @@ async fn diamond_of(
     Ok(whole(headers, &tag, cache, OCTETS, blob))
 }
 
-/// The answer to what is asked for most, a diamond that is kept in memory, without the router, which takes as long as all
-/// the rest: the same answer. `None` of whatever else is asked, which the router answers.
+/// The answer to what is asked for most, a diamond that is kept in memory, without the router, which takes a quarter of
+/// the time of an answer: the same answer. `None` of whatever else is asked, which the router answers.
 pub(super) fn at_once<B>(site: &Site, request: &Request<B>) -> Option<Response> {
     let path = request.uri().path();
     // What is written in another way is for the router to read.
