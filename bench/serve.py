@@ -23,7 +23,8 @@ import sys
 import time
 import urllib.request
 
-SIZES = ["1kB", "8kB", "64kB"]
+# Of these bytes each, and as a store is built from a DEM.
+SIZES = ["1kB", "8kB", "64kB", "built"]
 
 LUA = """
 local requests, next = {}, 0

@@ -1,5 +1,5 @@
-//! Makes what `scripts/bench-serve` asks for: stores whose diamonds have about 1, 8 and 64 kB, and the same diamonds as
-//! files, in the folders that their addresses name.
+//! Makes what `scripts/bench-serve` asks for: stores whose diamonds have about 1, 8 and 64 kB, a store as it is built, and
+//! the same diamonds as files, in the folders that their addresses name.
 //!
 //! `cargo run --release -p diamantina-tests --example blobs -- FOLDER` fills FOLDER with `stores/SIZE`, `files/scenes/...`
 //! and `SIZE.paths`, `SIZE.batches`: addresses of single diamonds and of batches, one a line.
@@ -19,8 +19,9 @@ const SAMPLES: u32 = 1025;
 /// Bytes of a batch, as the client asks for them.
 const BATCH_BYTES: usize = 256 << 10;
 
-/// Names of sizes, bytes of a diamond, diamonds at most.
-const SIZES: [(&str, usize, usize); 3] = [("1kB", 1000, 2000), ("8kB", 8000, 2000), ("64kB", 64000, 600)];
+/// Names of sizes, bytes of a diamond (none: its own, as it was built), diamonds at most.
+const SIZES: [(&str, Option<usize>, usize); 4] =
+    [("1kB", Some(1000), 2000), ("8kB", Some(8000), 2000), ("64kB", Some(64000), 600), ("built", None, 2000)];
 
 #[derive(Parser)]
 struct Arguments {
@@ -50,7 +51,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let real = Store::open(&real)?;
     let mut state = 1;
     for (name, bytes, most) in SIZES {
-        // A server never looks into payloads: these have the sizes asked for, and nothing to decode.
+        // A server never looks into payloads: those of a size that is asked for have nothing to decode.
         let mut scene = real.scene().clone();
         name.clone_into(&mut scene.name);
         let layer = &scene.layers[0];
@@ -62,29 +63,39 @@ fn main() -> Result<(), Box<dyn Error>> {
         let writer = Writer::create(&place)?;
         let key = |[x, y]: [u32; 2]| Key { layer: 0, kind: Kind::Points, a: x, b: y };
         for ((d, _), order) in diamonds.iter().zip(0..) {
-            writer.put(key(d.centre()), order, &noise(&mut state, bytes))?;
+            let payload = match bytes {
+                Some(bytes) => noise(&mut state, bytes),
+                None => real.get(key(d.centre()))?.ok_or("no such diamond")?,
+            };
+            writer.put(key(d.centre()), order, &payload)?;
         }
         writer.publish(scene, |_| true)?;
         let store = Store::open(&place)?;
         let (scene, layer) = (store.scene(), &store.scene().layers[0]);
-        let (mut paths, mut batches, mut batch) = (String::new(), String::new(), Vec::new());
+        let (mut paths, mut batches, mut batch, mut batch_bytes) =
+            (String::new(), String::new(), Vec::new(), 0);
+        let mut total = 0;
         for (d, _) in &diamonds {
             let centre = d.centre();
             let route = message::points_route(&scene.name, &scene.version, &layer.name, centre);
             let file = folder.join("files").join(route.trim_start_matches('/'));
             fs::create_dir_all(file.parent().ok_or("no folder")?)?;
-            fs::write(file, store.get(key(centre))?.ok_or("no such diamond")?)?;
+            let payload = store.get(key(centre))?.ok_or("no such diamond")?;
+            total += payload.len();
+            batch_bytes += payload.len();
+            fs::write(file, payload)?;
             paths += &format!("{route}\n");
             batch.push(centre);
-            if batch.len() == message::BATCH_MAX || batch.len() * bytes >= BATCH_BYTES {
+            if batch.len() == message::BATCH_MAX || batch_bytes >= BATCH_BYTES {
                 let route = message::batch_route(&scene.name, &scene.version, &layer.name, &batch);
                 batches += &format!("{} {route}\n", batch.len());
                 batch.clear();
+                batch_bytes = 0;
             }
         }
         fs::write(folder.join(format!("{name}.paths")), paths)?;
         fs::write(folder.join(format!("{name}.batches")), batches)?;
-        println!("{name}: {} diamonds of {bytes} bytes", diamonds.len());
+        println!("{name}: {} diamonds, {} bytes each", diamonds.len(), total / diamonds.len());
     }
     Ok(())
 }

@@ -148,7 +148,14 @@ impl Access {
         known.read_at = now;
         match read {
             Ok(scenes) => {
-                known.scenes = scenes;
+                let before = std::mem::replace(&mut known.scenes, scenes);
+                for scene in known.scenes.keys().filter(|scene| !before.contains_key(*scene)) {
+                    tracing::warn!(
+                        scene,
+                        "is private from now on; caches may keep for a year what it has answered to everybody: purge \
+                         them, or build it under another name"
+                    );
+                }
                 drop(known);
                 tracing::info!(file = %path.display(), "tokens were read again");
             }

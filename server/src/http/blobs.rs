@@ -5,7 +5,7 @@
 //! What is asked for again by itself also lies where the kernel can take it from.
 
 use super::metrics::Metrics;
-use super::sendfile::{Filed, Files};
+use super::sendfile::{Filed, Files, PAGE};
 use crate::store::{Key, Store, StoreError, number};
 use bytes::Bytes;
 use quick_cache::sync::{Cache, DefaultLifecycle};
@@ -54,6 +54,8 @@ impl Weighter<Name, Blob> for ByBytes {
 pub(super) struct Blobs {
     cache: Option<Cache<Name, Blob, ByBytes>>,
     files: Option<Arc<Files>>,
+    /// Bytes of a blob up to which it is kept together with its copy.
+    copied_max: u64,
     metrics: Arc<Metrics>,
 }
 
@@ -70,7 +72,9 @@ impl Blobs {
         let cache = options.build().ok().filter(|_| budget > 0).map(|options| {
             Cache::with_options(options, ByBytes, DefaultHashBuilder::default(), DefaultLifecycle::default())
         });
-        Self { cache, files, metrics }
+        // Twice the blob, and the rest of its last page.
+        let copied_max = (budget / SHARDS as u64).saturating_sub(PAGE + OVERHEAD_BYTES) / 2;
+        Self { cache, files, copied_max, metrics }
     }
 
     /// The blob, if it is kept.
@@ -90,6 +94,7 @@ impl Blobs {
     fn filed(&self, name: Name) -> Option<Blob> {
         let mut blob = self.kept(name)?;
         if blob.filed.is_none()
+            && blob.bytes.len() as u64 <= self.copied_max
             && let (Some(cache), Some(files)) = (&self.cache, &self.files)
             && let Some(filed) = files.put(&blob.bytes)
         {
@@ -238,6 +243,19 @@ mod tests {
             assert!(cache.len() < (8 << 20) / (20_000 + 20_480));
         }
         assert!(cache.len() > 100 && blobs.kept(name(4999)).is_some());
+    }
+
+    #[test]
+    fn in_a_small_cache_a_copy_does_not_drive_out_its_blob() {
+        let blobs = Blobs::new(256 << 10, Files::new(), Arc::new(Metrics::new(Arc::default())));
+        let cache = blobs.cache.as_ref().unwrap();
+        // A part of the cache has 32 KiB: none, one and two of these, or one with its copy.
+        for (length, kept) in [(40_000, false), (20_000, true), (16_384, true)] {
+            cache.insert(name(length), Bytes::from(vec![0; length as usize]).into());
+            for _ in 0..3 {
+                assert_eq!(blobs.filed(name(length)).is_some(), kept, "{length}");
+            }
+        }
     }
 
     #[test]

@@ -30,7 +30,7 @@ const LEAST: usize = 16 << 10;
 const PAGE_MAX: u64 = 1 << 16;
 
 /// Memory comes by the page.
-const PAGE: u64 = 4096;
+pub(super) const PAGE: u64 = 4096;
 
 /// The file.
 #[derive(Debug)]
