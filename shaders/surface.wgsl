@@ -9,7 +9,8 @@ struct Vertex {
     // The instance's: lattice point (0, 0) relative to the reference point; lattice steps of u and v.
     @location(3) origin: vec2<i32>,
     @location(4) axes: vec4<i32>,
-    // x: the level. y: the moment to draw, in ticks. z: ticks that a motion takes. w: the first tile of imagery.
+    // x: the level. y: the moment to draw, in ticks. z: ticks that a motion takes. w: the first tile of imagery. Of irregular
+    // triangles that are seen in some pixels, y and z: the bits of the two numbers of their share.
     @location(5) about: vec4<i32>,
     // Where in that tile a place lies: xy the eye, zw what a metre is.
     @location(10) drape: vec4<f32>,
@@ -49,6 +50,8 @@ struct Shaded {
     // Where in the first tile of imagery, from 0 to 1 east and north, and which that is.
     @location(2) drape: vec2<f32>,
     @location(3) @interpolate(flat) tile: u32,
+    // Where irregular triangles are seen: in pixels whose number is not below the first, and below the second.
+    @location(4) @interpolate(flat) share: vec2<f32>,
 }
 
 // A lattice point, relative to the reference point, drawn `lift` quanta above its own height. Up to the conversion to
@@ -67,6 +70,7 @@ fn placed(
         from_eye,
         drape.xy + drape.zw * across,
         u32(about.w),
+        bitcast<vec2<f32>>(about.yz),
     );
 }
 
@@ -95,6 +99,16 @@ fn terrain_morph_vertex(vertex: Vertex, motion: Motion) -> Shaded {
 @vertex
 fn tin_vertex(corner: Corner) -> Shaded {
     return placed(corner.origin + corner.place, corner.height, 0.0, corner.normal, corner.about, corner.drape);
+}
+
+// Whether triangles are seen in some pixels alone: see client/src/morph.rs.
+override IN_SOME_PIXELS: bool = false;
+
+// Whether a pixel is one of those that do not show them. Its number: interleaved gradient noise (Jimenez 2014), whose values are
+// spread evenly among pixels that are near one another.
+fn is_left_out(shaded: Shaded) -> bool {
+    let number = fract(52.9829189 * fract(dot(floor(shaded.clip.xy), vec2<f32>(0.06711056, 0.00583715))));
+    return IN_SOME_PIXELS && (number < shaded.share.x || number >= shaded.share.y);
 }
 
 // The unit normal, of the surface if its heights are multiplied by so much.

@@ -96,7 +96,11 @@ fn terrain_colour(shaded: Shaded) -> vec4<f32> {
 
 @fragment
 fn terrain_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
-    return terrain_colour(shaded);
+    let colour = terrain_colour(shaded);
+    if is_left_out(shaded) {
+        discard;
+    }
+    return colour;
 }
 
 // Seen in water: what is below its surface is not. Alpha tells how far away it is; of ground from below, which no light comes
@@ -104,7 +108,7 @@ fn terrain_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
 @fragment
 fn mirrored_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
     let colour = terrain_colour(shaded);
-    if shaded.from_eye.z < frame.water.w {
+    if shaded.from_eye.z < frame.water.w || is_left_out(shaded) {
         discard;
     }
     let is_below = dot(normal_of(shaded), shaded.from_eye) > 0.0;
@@ -114,5 +118,8 @@ fn mirrored_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
 // The sides of triangles.
 @fragment
 fn wire_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
+    if is_left_out(shaded) {
+        discard;
+    }
     return encoded(hazed(vec3<f32>(0.02), shaded.from_eye));
 }

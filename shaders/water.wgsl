@@ -303,6 +303,9 @@ fn water_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
 
     let still = normal_of(shaded);
     let slope = wave_slope(p.xy, dpdx(p.xy), dpdy(p.xy));
+    if is_left_out(shaded) {
+        discard;
+    }
     // Waves never turn a surface away from the eye.
     var normal = normalize(vec3<f32>(still.xy - slope.xy * still.z, still.z));
     let from_below = dot(ray, still) > 0.0;

@@ -1,5 +1,8 @@
-//! The fuzzer's seeds, and inputs like them, given to every decoder: what it once found stays mended.
+//! The fuzzers' seeds, and inputs like them, given to every decoder and to a server: what they once found stays mended.
 
+#[allow(unreachable_pub, reason = "a library of its own where it is fuzzed")]
+#[path = "../server/fuzz/src/lib.rs"]
+mod server_targets;
 #[allow(unreachable_pub, reason = "a library of its own where it is fuzzed")]
 #[path = "../protocol/fuzz/src/lib.rs"]
 mod targets;
@@ -7,6 +10,9 @@ mod targets;
 use crate::world::workspace;
 
 type Target = (&'static str, fn(&[u8]));
+
+const SERVER_TARGETS: [Target; 2] =
+    [("directory", server_targets::directory::run), ("request", server_targets::request::run)];
 
 const TARGETS: [Target; 9] = [
     ("batch_query", targets::batch_query::run),
@@ -22,6 +28,9 @@ const TARGETS: [Target; 9] = [
 
 /// Inputs made of each seed.
 const VARIANTS: u32 = 400;
+
+/// Of those that a server is asked or a store is written for.
+const SERVER_VARIANTS: u32 = 40;
 
 /// Numbers that look random, the same every time (xorshift).
 struct Dice(u64);
@@ -58,8 +67,17 @@ fn varied(seed: &[u8], dice: &mut Dice) -> Vec<u8> {
 
 #[test]
 fn every_decoder_stands_its_seeds_and_what_is_like_them() {
-    let corpus = workspace().join("protocol/fuzz/corpus");
-    for (name, run) in TARGETS {
+    stand("protocol", &TARGETS, VARIANTS);
+}
+
+#[test]
+fn a_server_and_a_store_stand_theirs() {
+    stand("server", &SERVER_TARGETS, SERVER_VARIANTS);
+}
+
+fn stand(package: &str, targets: &[Target], variants: u32) {
+    let corpus = workspace().join(package).join("fuzz/corpus");
+    for (name, run) in targets {
         let mut seeds: Vec<_> = std::fs::read_dir(corpus.join(name))
             .unwrap_or_else(|e| panic!("{name}: {e}"))
             .map(|entry| entry.unwrap().path())
@@ -71,7 +89,7 @@ fn every_decoder_stands_its_seeds_and_what_is_like_them() {
             let seed = std::fs::read(&path).unwrap();
             run(&seed);
             let mut dice = Dice(0x9E37_79B9_7F4A_7C15);
-            for _ in 0..VARIANTS {
+            for _ in 0..variants {
                 run(&varied(&seed, &mut dice));
             }
         }
@@ -80,9 +98,11 @@ fn every_decoder_stands_its_seeds_and_what_is_like_them() {
 
 #[test]
 fn every_target_is_tried_here() {
-    let targets = workspace().join("protocol/fuzz/fuzz_targets");
-    for entry in std::fs::read_dir(targets).unwrap() {
-        let name = entry.unwrap().file_name().into_string().unwrap();
-        assert!(TARGETS.iter().any(|(known, _)| name == format!("{known}.rs")), "{name}");
+    for (package, known) in [("protocol", &TARGETS[..]), ("server", &SERVER_TARGETS)] {
+        let targets = workspace().join(package).join("fuzz/fuzz_targets");
+        for entry in std::fs::read_dir(targets).unwrap() {
+            let name = entry.unwrap().file_name().into_string().unwrap();
+            assert!(known.iter().any(|(known, _)| name == format!("{known}.rs")), "{package}: {name}");
+        }
     }
 }

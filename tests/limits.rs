@@ -1,7 +1,9 @@
 //! Who asks too much, too slowly or for nothing does not disturb the others.
 
+use crate::service::metric;
 use crate::world::{World, serve_within};
 use diamantina_protocol::diamond::Diamond;
+use diamantina_protocol::message;
 use diamantina_server::http::Limits;
 use std::io::{self, Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -21,6 +23,19 @@ fn address(url: &str) -> SocketAddr {
 
 pub(crate) fn connect(url: &str) -> TcpStream {
     let stream = TcpStream::connect(address(url)).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream
+}
+
+/// Connects from another address of this machine.
+fn connect_from(from: &str, url: &str) -> TcpStream {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    let stream = runtime.block_on(async {
+        let socket = tokio::net::TcpSocket::new_v4().unwrap();
+        socket.bind(SocketAddr::new(from.parse().unwrap(), 0)).unwrap();
+        socket.connect(address(url)).await.unwrap().into_std().unwrap()
+    });
+    stream.set_nonblocking(false).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
     stream
 }
@@ -167,6 +182,57 @@ fn without_room_for_an_answer_one_is_told_when_to_come_back() {
     assert!(until_answered(&served.address, "/scenes", "503").contains("503"), "it was full meanwhile");
     // It is given up in the end, and its place is free.
     until_answered(&served.address, "/scenes", "200 OK");
+}
+
+/// Asks for a path on so many streams of HTTP/2 and takes none of the answers: its windows have no room.
+fn ask_and_take_nothing(address: &str, path: &str, streams: u32) -> TcpStream {
+    let frame = |kind: u8, flags: u8, stream: u32, payload: &[u8]| {
+        let length = u32::try_from(payload.len()).unwrap().to_be_bytes();
+        [&length[1..], &[kind, flags], &stream.to_be_bytes(), payload].concat()
+    };
+    // SETTINGS_INITIAL_WINDOW_SIZE is 0.
+    let settings = frame(4, 0, 0, &[0, 4, 0, 0, 0, 0]);
+    let text =
+        |name: u8, value: &str| [&[name, u8::try_from(value.len()).unwrap()], value.as_bytes()].concat();
+    // GET, http, :path and :authority, neither compressed nor kept (RFC 7541).
+    let head = [vec![0x82, 0x86], text(0x04, path), text(0x01, "here")].concat();
+    let mut sent = [b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".to_vec(), settings].concat();
+    for stream in 0..streams {
+        // The headers are whole, and nothing follows.
+        sent.extend(frame(1, 0b101, 2 * stream + 1, &head));
+    }
+    let mut greedy = connect(address);
+    greedy.write_all(&sent).unwrap();
+    greedy
+}
+
+#[test]
+fn one_address_cannot_take_all_the_room_for_answers() {
+    let world = World::sample(513, 0.0);
+    let limits = Limits {
+        max_connections_per_address: 6,
+        max_in_flight: 8,
+        still: milliseconds(20_000),
+        ..Limits::default()
+    };
+    let served = serve_within(&[world.folder.path().join("store")], limits);
+    let layer = &world.report.scene.layers[0];
+    let root = layer.forest.root_diamonds().next().unwrap().centre();
+    let path = message::points_route("world", &world.report.scene.version, &layer.name, root);
+    let _greedy = [4, 4].map(|streams| ask_and_take_nothing(&served.address, &path, streams));
+    let refused = until_answered(&served.address, "/scenes", "503").to_lowercase();
+    assert!(refused.contains("retry-after: 1"), "{refused}");
+    // Two places are left for others.
+    let mut other = connect_from("127.0.0.2", &served.address);
+    request(&mut other, "/scenes");
+    let found = answer(&mut other);
+    assert!(found.contains("200 OK"), "{found}");
+    assert!(metric(&served, "diamantina_rejections_total{reason=\"in_flight_of_address\"}") >= 3.0);
+    assert_eq!(
+        metric(&served, "diamantina_in_flight"),
+        9.0,
+        "eight that are not taken, two of them refusals, and this one"
+    );
 }
 
 #[test]

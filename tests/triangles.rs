@@ -224,8 +224,6 @@ fn what_triangles_cannot_do_is_refused_with_the_remedy() {
     );
     let (code, text) = client(&["render", &scene, "-o", "a.png", "--stream"]);
     assert!(code == Some(2) && text.contains("leave --stream or --encoding tin out"), "{text}");
-    let (code, text) = client(&["fly", &scene, "--morph", "1"]);
-    assert!(code == Some(2) && text.contains("leave --morph or --encoding tin out"), "{text}");
 }
 
 /// Goes on until the scene is streamed otherwise, and looks at each frame on the way.

@@ -80,7 +80,7 @@ struct DoctorArgs {
 struct ViewerArgs {
     #[command(flatten)]
     view: ViewArgs,
-    /// Seconds that points take to move where the level of detail changes [default: 0.3, and 0 for tin and with --true]
+    /// Seconds that points take to move where the level of detail changes [default: 0.3, and 0 with --true]
     #[arg(long, value_name = "SECONDS")]
     morph: Option<f64>,
     /// Keep nothing on the disk
@@ -355,7 +355,6 @@ impl ViewArgs {
                 TerrainError::Fetch(FetchError::Address { .. } | FetchError::Layer { .. })
                     | TerrainError::Zone { .. }
                     | TerrainError::Texture { .. }
-                    | TerrainError::Still
             );
             Failure(if wrong_use { 2 } else { 1 }, error.to_string())
         })?;
@@ -455,10 +454,7 @@ fn print_report(args: &RenderArgs, r: &PictureReport) -> std::io::Result<()> {
 }
 
 fn view(args: &ViewerArgs) -> Result<(), Failure> {
-    let morph = args.morph.unwrap_or(match args.view.encoding {
-        EncodingName::Points if !args.view.look.is_true => MORPH_SECONDS,
-        EncodingName::Points | EncodingName::Tin => 0.0,
-    });
+    let morph = args.morph.unwrap_or(if args.view.look.is_true { 0.0 } else { MORPH_SECONDS });
     if !(0.0..=morph::SECONDS_MAX).contains(&morph) {
         let max = morph::SECONDS_MAX;
         return Err(Failure(2, format!("--morph {morph}: expected seconds from 0 to {max}")));

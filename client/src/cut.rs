@@ -18,7 +18,7 @@ mod show;
 pub use show::{Showing, show, sight};
 
 use crate::camera::{Bounds, Camera, Plane, nearest_drawn};
-use crate::drawing::DrawItem;
+use crate::drawing::{DrawItem, Share};
 use crate::encoding::Encoding;
 use crate::sight::{self, Sight};
 use crate::surface::Surface;
@@ -379,6 +379,7 @@ pub fn draw(
                 surface: Arc::clone(surface),
                 sides: sides.bits,
                 moving: None,
+                share: Share::ALL,
             });
         }
     }

@@ -19,6 +19,24 @@ pub struct DrawItem {
     pub sides: u8,
     /// How its points move, if they do.
     pub moving: Option<Moving>,
+    /// The pixels that show it, where irregular triangles appear or go.
+    pub share: Share,
+}
+
+/// Pixels of a picture, which all have numbers from 0 to below 1: those of which it is not below the first number, and below the
+/// second one.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Share(pub [f32; 2]);
+
+impl Share {
+    /// All pixels.
+    pub const ALL: Self = Self([0.0, 1.0]);
+
+    /// Whether they are all of a picture's.
+    #[must_use]
+    pub fn is_all(&self) -> bool {
+        self.0[0] <= 0.0 && self.0[1] >= 1.0
+    }
 }
 
 impl DrawItem {

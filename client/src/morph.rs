@@ -1,5 +1,8 @@
 //! Motions: from one cut to the next, what is drawn moves and does not jump.
 //!
+//! Of irregular triangles, which have no points that halve others' edges, a split *appears*: see [`Motion::share`]. All that
+//! follows is of points.
+//!
 //! A diamond that begins to be drawn as split starts from the surface that its parents drew and reaches its own
 //! heights after a set time; one that nothing wants split any more goes back the same way, and only then is it
 //! merged. After Hoppe's geomorphs (*Smooth View-Dependent Level-of-Detail Control*, 1998).
@@ -104,12 +107,6 @@ impl Record {
         self.from != self.to || self.from_normal != self.to_normal
     }
 
-    /// How much of the way is done: 0 at the start and before, 1 at the end, with no speed at either.
-    fn weight(&self, now: Moment, duration: i32) -> f32 {
-        let t = (now.since(Moment(self.start)) as f32 / duration as f32).clamp(0.0, 1.0);
-        t * t * (3.0 - 2.0 * t)
-    }
-
     /// How far above its own height the point is drawn, in quanta, and with which normal. The twin of the vertex
     /// shader's.
     #[must_use]
@@ -117,7 +114,7 @@ impl Record {
         if now.since(Moment(self.start)) >= duration {
             return (self.to, self.to_normal);
         }
-        let weight = self.weight(now, duration);
+        let weight = weight(now.since(Moment(self.start)), duration);
         let normal = [0, 1].map(|i| {
             let [from, to] = [self.from_normal[i], self.to_normal[i]].map(f32::from);
             let between = from + (to - from) * weight;
@@ -131,12 +128,13 @@ impl Record {
 /// Where a point is, or will be: quanta above its own height, and its normal.
 pub type Place = (f32, [i16; 2]);
 
-/// The motion of a split diamond's points.
+/// The motion of a split diamond's points, or the way in which its irregular triangles appear.
 ///
-/// Takes `20 ((n+1)^2 + n^2)` bytes: 166 kB for n = 64.
+/// Takes `20 ((n+1)^2 + n^2)` bytes: 166 kB for n = 64. Of irregular triangles it takes next to nothing.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Motion {
     records: Vec<Record>,
+    appears: Option<Appearance>,
     duration: i32,
     end: Moment,
     merging: bool,
@@ -145,7 +143,7 @@ pub struct Motion {
 }
 
 impl Motion {
-    /// A record for each slot of the block.
+    /// A record for each slot of the block; none of irregular triangles.
     #[must_use]
     pub fn records(&self) -> &[Record] {
         &self.records
@@ -171,9 +169,41 @@ impl Motion {
         self.error_metres
     }
 
+    /// The part of the picture's pixels in which a split of irregular triangles is seen, from 0 to 1: in the others the parents'
+    /// surface is. Each pixel has a number, and the split is seen where that is below this share.
+    ///
+    /// A diamond has no less of it than its children, which begin later and end sooner. So whatever a pixel's number is, the
+    /// splits that it sees hold the parents of each, and are a cut without cracks like any other. Points appear at once.
+    #[must_use]
+    pub fn share(&self, now: Moment) -> f32 {
+        self.appears.map_or(1.0, |appears| appears.at(now, self.duration))
+    }
+
     fn is_over(&self, now: Moment) -> bool {
         now.since(self.end) >= 0
     }
+}
+
+/// How a share changes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Appearance {
+    from: f32,
+    to: f32,
+    start: Moment,
+}
+
+impl Appearance {
+    fn at(&self, now: Moment, duration: i32) -> f32 {
+        let part = weight(now.since(self.start), duration);
+        // Exactly where it goes to in the end.
+        self.from * (1.0 - part) + self.to * part
+    }
+}
+
+/// How much of the way is done after an age: 0 at the start and before, 1 at the end, with no speed at either.
+fn weight(age: i32, duration: i32) -> f32 {
+    let t = (age as f32 / duration as f32).clamp(0.0, 1.0);
+    t * t * (3.0 - 2.0 * t)
 }
 
 /// What is to be known of a diamond that would begin to move.
@@ -389,13 +419,15 @@ impl Morphs {
     }
 
     fn start(&mut self, change: &Change, d: Diamond, way: Way, starts: &mut usize) -> bool {
+        let Some(resident) = (change.surface)(d) else { return false };
+        let Some(surface) = resident.points() else {
+            self.appear(change, d, way);
+            return true;
+        };
         let is_full = self.motions.len() >= self.motions_max && !self.motions.contains_key(&d);
         if *starts == 0 || is_full {
             return false;
         }
-        let Some(resident) = (change.surface)(d) else { return false };
-        // Irregular triangles do not move.
-        let Some(surface) = resident.points() else { return true };
         let parents = change.layer.forest.parents(d);
         let parent = |p: Diamond| {
             let motion = self.motions.get(&p).map(Arc::as_ref);
@@ -420,6 +452,30 @@ impl Morphs {
         }
         self.motions.insert(d, Arc::new(motion));
         true
+    }
+
+    /// Has irregular triangles appear, or go.
+    fn appear(&mut self, change: &Change, d: Diamond, way: Way) {
+        let here = self.motions.get(&d).map(|motion| motion.share(change.now));
+        let [from, to] = match way {
+            Way::Out => [0.0, 1.0],
+            Way::Back => [here.unwrap_or(1.0), 1.0],
+            Way::Home => [here.unwrap_or(1.0), 0.0],
+            // What the parents' border does is nothing to it.
+            Way::Along => return,
+        };
+        let parents = change.layer.forest.parents(d).filter_map(|parent| self.motions.get(&parent));
+        let errors = parents.map(|motion| motion.error_metres);
+        let motion = Motion {
+            records: Vec::new(),
+            appears: Some(Appearance { from, to, start: change.now }),
+            duration: self.duration,
+            end: Moment(change.now.0.wrapping_add(self.duration)),
+            merging: way == Way::Home,
+            span: 0.0,
+            error_metres: errors.fold((change.sight)(d).error_metres, f32::max),
+        };
+        self.motions.insert(d, Arc::new(motion));
     }
 }
 
@@ -474,11 +530,7 @@ impl Start<'_> {
     fn motion(&self, way: Way, declared_metres: f32, quantum: f64, scratch: &mut Scratch) -> Motion {
         let (heights, normals) = (self.surface.block().heights(), self.surface.normals());
         let Scratch { sources, before } = scratch;
-        self.find_sources(sources);
-        before.clear();
-        if matches!(way, Way::Out | Way::Home) {
-            before.extend(self.before(sources, way == Way::Out));
-        }
+        self.look_at_parents(way, sources, before);
         let mut records: Vec<Record> = normals.iter().map(|normal| Record::still(*normal)).collect();
         let (mut end, shift) = self.take_borders(sources, &mut records);
         let mut begin = |slot: usize, from: Place, to: Place| {
@@ -509,11 +561,14 @@ impl Start<'_> {
         let errors = errors.map(|motion| motion.error_metres);
         let error_metres = errors.fold(declared_metres, f32::max) + shift * quantum as f32;
         let merging = way == Way::Home;
-        Motion { records, duration: self.duration, end, merging, span, error_metres }
+        Motion { records, appears: None, duration: self.duration, end, merging, span, error_metres }
     }
 
     /// Gives the border the parents' records; until when it moves, and how far it has still to go, in quanta.
     fn take_borders(&self, sources: &[Source], records: &mut [Record]) -> (Moment, f32) {
+        if sources.is_empty() {
+            return (self.now, 0.0);
+        }
         let (heights, n) = (self.surface.block().heights(), self.surface.block().segments());
         let upper = self.forest.local(self.d).upper;
         let (mut end, mut shift) = (self.now, 0.0f32);
@@ -551,38 +606,46 @@ impl Start<'_> {
         old.map(|slot| (slot, [slot; 2])).chain(centres)
     }
 
-    /// Where the parents have each slot.
-    fn find_sources(&self, sources: &mut Vec<Source>) {
+    /// Where the parents that move have each slot, if any does; and, where the way leads from or to their surface, what they
+    /// have there: as they draw it at this moment, or as it will be in the end.
+    fn look_at_parents(&self, way: Way, sources: &mut Vec<Source>, before: &mut Vec<Before>) {
+        let slots = self.surface.block().heights().len();
         sources.clear();
-        sources.resize(self.surface.block().heights().len(), NOWHERE);
+        before.clear();
+        if self.parents.iter().any(|parent| parent.motion.is_some()) {
+            sources.resize(slots, NOWHERE);
+        }
+        let is_needed = matches!(way, Way::Out | Way::Home);
+        if is_needed {
+            before.resize(slots, Before { height: NODATA, lift: 0.0, normal: [0; 2] });
+        }
         for (parent, bit) in self.parents.iter().zip([0, PARENT]) {
-            walk_shared(self.forest, self.d, parent.diamond, |to, from| sources[to] = bit | from as Source);
+            let Some(points) = parent.surface.points() else { continue };
+            let (heights, normals) = (points.block().heights(), points.normals());
+            let (forest, d, at) = (self.forest, self.d, parent.diamond);
+            if let Some(motion) = parent.motion {
+                walk_shared(forest, d, at, |to, from| sources[to] = bit | from as Source);
+                if way == Way::Out {
+                    walk_shared(forest, d, at, |to, from| {
+                        let (lift, normal) = self.drawn(&motion.records[from]);
+                        before[to] = Before { height: heights[from], lift, normal };
+                    });
+                    continue;
+                }
+            }
+            if is_needed {
+                walk_shared(forest, d, at, |to, from| {
+                    before[to] = Before { height: heights[from], lift: 0.0, normal: normals[from] };
+                });
+            }
         }
     }
 
-    /// The parent that has a point, and its slot there; `None` if it is new.
-    fn parent(&self, source: Source) -> Option<(&Parent<'_>, usize)> {
-        let number = usize::from(source & PARENT != 0);
-        (source != NOWHERE).then(|| (&self.parents[number], (source & !PARENT) as usize))
-    }
-
-    /// What a parent notes of the motion of a point.
+    /// What a parent that moves notes of the motion of a point.
     fn record(&self, source: Source) -> Option<Record> {
-        let (parent, slot) = self.parent(source)?;
-        parent.motion.map(|motion| motion.records[slot])
-    }
-
-    /// What the parents have of each slot: as they draw it at this moment, or as it will be in the end.
-    fn before(&self, sources: &[Source], at_once: bool) -> impl Iterator<Item = Before> {
-        let nothing = Before { height: NODATA, lift: 0.0, normal: [0; 2] };
-        let find = move |source: Source| {
-            let (parent, slot) = self.parent(source)?;
-            let points = parent.surface.points()?;
-            let drawn = parent.motion.filter(|_| at_once).map(|motion| self.drawn(&motion.records[slot]));
-            let (lift, normal) = drawn.unwrap_or_else(|| (0.0, points.normals()[slot]));
-            Some(Before { height: points.block().heights()[slot], lift, normal })
-        };
-        sources.iter().map(move |source| find(*source).unwrap_or(nothing))
+        let parent = &self.parents[usize::from(source != NOWHERE && source & PARENT != 0)];
+        let motion = parent.motion.filter(|_| source != NOWHERE)?;
+        Some(motion.records[(source & !PARENT) as usize])
     }
 
     fn drawn(&self, record: &Record) -> Place {

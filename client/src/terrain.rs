@@ -119,8 +119,6 @@ pub struct Terrain {
     scene_changed: bool,
     /// How the scene is to be streamed from now on, until it is.
     chosen: Option<Options>,
-    /// Seconds of motions where the encoding has any.
-    morph_seconds: f64,
     /// The version that takes over, once this one has been replaced.
     reload: Option<Reload>,
     /// The declared error of the last frame.
@@ -186,9 +184,6 @@ impl Terrain {
         if !(0.0..=morph::SECONDS_MAX).contains(&options.morph_seconds) {
             return Err(TerrainError::Morph(options.morph_seconds));
         }
-        if options.morph_seconds > 0.0 && options.fetch.encoding == Encoding::Tin {
-            return Err(TerrainError::Still);
-        }
         let opened = Instant::now();
         let (fetcher, scene) = Fetcher::connect(url, &options.fetch).await?;
         let encoding = options.fetch.encoding;
@@ -228,7 +223,6 @@ impl Terrain {
         let cache = Cache::new(forests, shares.surfaces);
         let scene = Arc::new(scene);
         let shown = options.layers.clone();
-        let morph_seconds = options.morph_seconds;
         let steps = Steps::of(&scene, options.time);
         let mut terrain = Self {
             url: fetcher.address(),
@@ -246,7 +240,6 @@ impl Terrain {
             problem: None,
             scene_changed: false,
             chosen: None,
-            morph_seconds,
             reload: None,
             error_pixels: f64::INFINITY,
             traffic_before: Traffic::default(),
@@ -322,22 +315,21 @@ impl Terrain {
         }
     }
 
-    /// Seconds that points take to move where the level of detail changes, where the encoding has motions.
+    /// Seconds that points take to move where the level of detail changes.
     #[must_use]
     pub fn morph_seconds(&self) -> f64 {
-        self.morph_seconds
+        self.options.morph_seconds
     }
 
     /// Sets them, from 0 to [`morph::SECONDS_MAX`]; what is on its way jumps.
     pub fn set_morph_seconds(&mut self, seconds: f64) {
-        self.morph_seconds = seconds.clamp(0.0, morph::SECONDS_MAX);
-        let of = |encoding| if encoding == Encoding::Points { self.morph_seconds } else { 0.0 };
-        self.options.morph_seconds = of(self.options.fetch.encoding);
+        let seconds = seconds.clamp(0.0, morph::SECONDS_MAX);
+        self.options.morph_seconds = seconds;
         if let Some(chosen) = &mut self.chosen {
-            chosen.morph_seconds = of(chosen.fetch.encoding);
+            chosen.morph_seconds = seconds;
         }
         for state in &mut self.layers {
-            state.morphs = Morphs::new(self.options.morph_seconds);
+            state.morphs = Morphs::new(seconds);
         }
     }
 
@@ -710,7 +702,9 @@ impl LayerState {
         let moving = cut.moving();
         if moving > 0 {
             let showing = cut::show(number, ask, &self.ideal, entry, &cut, now);
-            if showing.items.iter().map(|item| item.gpu_bytes(wires)).sum::<u64>() > self.gpu_bytes {
+            // Those of a diamond follow one another, and share its surface.
+            let of_diamonds = showing.items.chunk_by(|a, b| a.diamond == b.diamond).map(|items| &items[0]);
+            if of_diamonds.map(|item| item.gpu_bytes(wires)).sum::<u64>() > self.gpu_bytes {
                 self.morphs.jump(&drawing.splits);
                 return 0;
             }

@@ -117,7 +117,7 @@ fn options(address: &Address, token: Option<String>) -> Result<terrain::Options,
         tolerance_pixels,
         memory_bytes: MEMORY_BYTES,
         gpu_bytes: GPU_BYTES,
-        morph_seconds: if encoding == Encoding::Points { MORPH_SECONDS } else { 0.0 },
+        morph_seconds: MORPH_SECONDS,
         // Half of what a window takes: as much again is on the GPU.
         texture_bytes: 64 << 20,
         fade_seconds: FADE_SECONDS,

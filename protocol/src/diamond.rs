@@ -389,9 +389,19 @@ pub fn walk_shared(forest: &Forest, child: Diamond, parent: Diamond, mut copy: i
     let centres = !forest.adds_points(child.level()) && child.level() % 2 == 1;
     for q in (0..=2 * n).step_by(if centres { 1 } else { 2 }) {
         let (first, last) = if shared.lower { (q, 2 * n) } else { (q % 2, q) };
-        for p in (first..=last).step_by(2) {
-            let [p2, q2] = shared.at2(p, q);
-            copy(Block::slot(n, p, q), Block::slot(from, p2 as usize, q2 as usize));
+        // Along a row, old points of the parent alternate with centres: each kind lies at even steps.
+        for p in [first, first + 2].into_iter().filter(|p| *p <= last) {
+            let slot_of = |p: usize| {
+                let [p2, q2] = shared.at2(p, q);
+                Block::slot(from, p2 as usize, q2 as usize) as i64
+            };
+            let (mut to, mut slot) = (Block::slot(n, p, q), slot_of(p));
+            let step = if p + 4 <= last { slot_of(p + 4) - slot } else { 0 };
+            for _ in (p..=last).step_by(4) {
+                copy(to, slot as usize);
+                to += 2;
+                slot += step;
+            }
         }
     }
 }

@@ -6,12 +6,12 @@
 use super::near::{self, Near};
 use super::{Ask, Ideal, unknown};
 use crate::camera::Plane;
-use crate::drawing::{DrawItem, Moving};
+use crate::drawing::{DrawItem, Moving, Share};
 use crate::morph::{self, Moment, Sight};
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::index::Entry;
 use foldhash::fast::RandomState;
-use std::collections::HashSet;
+use std::collections::HashMap;
 use std::sync::Arc;
 
 /// An error of fewer pixels than this comes and goes without a motion: nobody sees it.
@@ -54,7 +54,10 @@ pub fn show(
 ) -> Showing {
     let forest = &ask.layer.forest;
     let seen = |d: Diamond| seen(ask, ideal, d, entry(d));
-    let split: HashSet<Diamond, RandomState> = cut.shown.iter().map(|shown| shown.diamond).collect();
+    // Those that are split, and in which share of the pixels.
+    let share = |shown: &morph::Shown| shown.motion.as_ref().map_or(1.0, |motion| motion.share(now));
+    let split: HashMap<Diamond, f32, RandomState> =
+        cut.shown.iter().map(|shown| (shown.diamond, share(shown))).collect();
     let (mut showing, mut errors) = (Showing::default(), Vec::new());
     for shown in &cut.shown {
         let d = shown.diamond;
@@ -75,14 +78,24 @@ pub fn show(
             let all = if forest.local(d).upper { 0b1111 } else { 0b11 };
             sides = if seen(d).in_view { all } else { 0 };
         }
+        let share = share(shown);
+        let mut item = |sides: u8, from: f32| {
+            let moves = shown.surface.points().is_some();
+            let moving = shown.motion.clone().filter(|_| moves).map(|motion| Moving { motion, now });
+            let (surface, share) = (Arc::clone(&shown.surface), Share([from, share]));
+            showing.items.push(DrawItem { layer: number, diamond: d, surface, sides, moving, share });
+        };
         for (side, child) in forest.children(d).into_iter().enumerate() {
-            let open = child.filter(|child| !split.contains(child) && seen(*child).in_view);
-            sides |= u8::from(open.is_some()) << side;
+            let Some(child) = child.filter(|child| seen(*child).in_view) else { continue };
+            match split.get(&child) {
+                None => sides |= 1 << side,
+                // Where the child is not seen yet, or any more, this is.
+                Some(part) if *part < share => item(1 << side, *part),
+                Some(_) => {}
+            }
         }
-        if sides != 0 {
-            let moving = shown.motion.clone().map(|motion| Moving { motion, now });
-            let surface = Arc::clone(&shown.surface);
-            showing.items.push(DrawItem { layer: number, diamond: d, surface, sides, moving });
+        if sides != 0 && share > 0.0 {
+            item(sides, 0.0);
         }
     }
     let mut pixels: Vec<f64> = errors.iter().map(|error| error.pixels).collect();

@@ -14,8 +14,9 @@
 //! | `offscreen` | pictures without a window |
 //!
 //! A diamond is one or two draws: its points at their own buffer, its place and axes as an instance, the
-//! index lists shared by all. One in motion has a second buffer, of the motions of its points, and a pipeline that
-//! reads it; irregular triangles have vertices and index lists of their own, and theirs. Nothing is used that WebGL2 lacks: no storage buffers, no base vertex, no
+//! index lists shared by all; irregular triangles have vertices and index lists of their own. One in motion has a second
+//! buffer, of the motions of its points, and a pipeline that reads it; irregular triangles that appear have one that leaves out
+//! pixels. Nothing is used that WebGL2 lacks: no storage buffers, no base vertex, no
 //! indirect draws. Depth is reversed and infinite, positions are relative to the eye.
 
 mod drape;
@@ -195,7 +196,8 @@ struct Instance {
     origin: [i32; 2],
     axes: [i32; 4],
     level: i32,
-    /// The moment to draw, and ticks that a motion takes; 0 and 1 where nothing moves.
+    /// The moment to draw, and ticks that a motion takes; 0 and 1 where nothing moves. Of irregular triangles that are seen in
+    /// some pixels: the bits of the two numbers of their share.
     now: i32,
     duration: i32,
     /// The first tile of imagery, and where in it the eye is and what a metre is.
@@ -436,12 +438,13 @@ impl Renderer {
                 let distance = bounds.distance(view.eye());
                 let shares_triangles = resident.own.is_none();
                 let kind = match &*item.surface {
-                    Surface::Tin(_) => Kind::Corners,
                     // What is mirrored stands still while it moves in the picture.
                     Surface::Points(_) if item.moving.is_some() && resident.motion.is_some() => {
                         Kind::MovingPoints
                     }
                     Surface::Points(_) => Kind::Points,
+                    Surface::Tin(_) if !item.share.is_all() => Kind::FadingCorners,
+                    Surface::Tin(_) => Kind::Corners,
                 };
                 Some(Draw { item, sides, shares_triangles, kind, bounds, distance })
             })
@@ -477,10 +480,11 @@ impl Renderer {
             let Some(resident) = self.residents.get(draw.item) else { continue };
             let triangles = resident.own.as_ref().or(grid.map(|grid| &grid.triangles));
             let Some(triangles) = triangles else { continue };
+            let [instance_slot, vertex_slot] = draw.kind.buffers();
             if kind_now != Some(draw.kind) {
                 kind_now = Some(draw.kind);
                 pass.set_pipeline(&pipelines[draw.kind as usize]);
-                pass.set_vertex_buffer(if draw.kind == Kind::Corners { 1 } else { 2 }, instances.slice(..));
+                pass.set_vertex_buffer(instance_slot, instances.slice(..));
                 places_now = None;
             }
             if layer_now != Some(draw.item.layer) {
@@ -500,7 +504,7 @@ impl Renderer {
                     wgpu::IndexFormat::Uint16,
                 );
             }
-            pass.set_vertex_buffer(u32::from(draw.kind != Kind::Corners), resident.points.slice(..));
+            pass.set_vertex_buffer(vertex_slot, resident.points.slice(..));
             if let Some(motion) = &resident.motion {
                 pass.set_vertex_buffer(3, motion.records.slice(..));
             }
@@ -575,7 +579,7 @@ impl Lens {
             .map(|draw| {
                 let layer = draw.item.layer;
                 let mut local = layers[layer].forest.local(draw.item.diamond);
-                if draw.kind == Kind::Corners {
+                if draw.item.surface.tin().is_some() {
                     local.origin = draw.item.diamond.centre().map(i64::from);
                 }
                 // Steps are at most a root square's side, 2^24.
@@ -583,6 +587,11 @@ impl Lens {
                     .map(|step| i32::try_from(step).unwrap_or(0));
                 let moving = draw.item.moving.as_ref();
                 let (now, duration) = moving.map_or((0, 1), |m| (m.now.ticks(), m.motion.duration()));
+                // Neither has both: the bits of floats.
+                let [now, duration] = match draw.kind {
+                    Kind::FadingCorners => draw.item.share.0.map(|part| part.to_bits().cast_signed()),
+                    _ => [now, duration],
+                };
                 let is_terrain = layers[layer].kind == message::Kind::Terrain;
                 let start =
                     if is_terrain { renderer.drapes.start(&draw.bounds, view) } else { Start::default() };

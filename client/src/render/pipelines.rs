@@ -28,6 +28,18 @@ pub(super) enum Kind {
     Points,
     MovingPoints,
     Corners,
+    /// In some of the pixels.
+    FadingCorners,
+}
+
+impl Kind {
+    /// The places of the buffers of a diamond's instance and its vertices.
+    pub(super) fn buffers(self) -> [u32; 2] {
+        match self {
+            Self::Points | Self::MovingPoints => [2, 1],
+            Self::Corners | Self::FadingCorners => [1, 0],
+        }
+    }
 }
 
 /// How triangles are drawn.
@@ -52,7 +64,7 @@ pub(super) struct Target {
 }
 
 /// A pipeline for each kind.
-pub(super) type Pipelines = [wgpu::RenderPipeline; 3];
+pub(super) type Pipelines = [wgpu::RenderPipeline; 4];
 
 /// What the vertex shaders take of each buffer: see `shaders/terrain.wgsl`.
 const PLACE: &[wgpu::VertexAttribute] = &wgpu::vertex_attr_array![0 => Uint16x2];
@@ -65,7 +77,8 @@ pub(super) const RECORD: &[wgpu::VertexAttribute] =
 const CORNER: &[wgpu::VertexAttribute] =
     &wgpu::vertex_attr_array![0 => Sint32x2, 1 => Sint32, 2 => Snorm16x2];
 
-/// The pipelines of diamonds that stand still, of those that move, and of irregular triangles: in the order of [`Kind`].
+/// The pipelines of points that stand still and that move, and of irregular triangles in all pixels and in some: in the order of
+/// [`Kind`].
 pub(super) fn terrain_pipelines(
     device: &wgpu::Device,
     target: Target,
@@ -90,9 +103,9 @@ pub(super) fn terrain_pipelines(
         Mode::Mirrored => (TERRAIN_WGSL, "mirrored_fragment"),
         Mode::Water => (WATER_WGSL, "water_fragment"),
     };
-    let groups: Vec<_> = groups.iter().map(|group| Some(*group)).collect();
+    let stage = Stage::new(device, source, groups);
     // Both faces are drawn: terrain seen from below is terrain still.
-    let made = |vertex, buffers: &[_]| {
+    let made = |kind, vertex, buffers: &[_]| {
         let compare = match mode {
             Mode::Lines => wgpu::CompareFunction::GreaterEqual,
             _ => wgpu::CompareFunction::Greater,
@@ -102,12 +115,13 @@ pub(super) fn terrain_pipelines(
             Mode::Lines => wgpu::PrimitiveTopology::LineList,
             _ => wgpu::PrimitiveTopology::TriangleList,
         };
-        pipeline(device, target, &groups, [vertex, fragment], source, buffers, depth, topology)
+        stage.pipeline(device, target, [vertex, fragment], kind, buffers, depth, topology)
     };
     [
-        made("terrain_vertex", &points[..3]),
-        made("terrain_morph_vertex", &points),
-        made("tin_vertex", &corners),
+        made(Kind::Points, "terrain_vertex", &points[..3]),
+        made(Kind::MovingPoints, "terrain_morph_vertex", &points),
+        made(Kind::Corners, "tin_vertex", &corners),
+        made(Kind::FadingCorners, "tin_vertex", &corners),
     ]
 }
 
@@ -129,64 +143,91 @@ pub(super) fn sky_pipeline(
     let entries = ["sky_vertex", "sky_fragment"];
     let depth = Depth { compare: wgpu::CompareFunction::GreaterEqual, write: false, behind: false };
     let topology = wgpu::PrimitiveTopology::TriangleList;
-    pipeline(device, target, &[Some(frame)], entries, SKY_WGSL, &[], depth, topology)
+    Stage::new(device, SKY_WGSL, &[frame]).pipeline(
+        device,
+        target,
+        entries,
+        Kind::Points,
+        &[],
+        depth,
+        topology,
+    )
 }
 
-/// A pipeline with these entry points of a vertex and a fragment shader.
-#[allow(clippy::too_many_arguments, reason = "a pipeline is made of so many things, each of its own type")]
-fn pipeline(
-    device: &wgpu::Device,
-    target: Target,
-    groups: &[Option<&wgpu::BindGroupLayout>],
-    [vertex, fragment]: [&str; 2],
-    source: &str,
-    buffers: &[Option<wgpu::VertexBufferLayout<'_>>],
-    depth: Depth,
-    topology: wgpu::PrimitiveTopology,
-) -> wgpu::RenderPipeline {
-    let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
-        label: Some(vertex),
-        source: wgpu::ShaderSource::Wgsl(source.into()),
-    });
-    let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-        label: Some(vertex),
-        bind_group_layouts: groups,
-        immediate_size: 0,
-    });
-    device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
-        label: Some(vertex),
-        layout: Some(&layout),
-        vertex: wgpu::VertexState {
-            module: &module,
-            entry_point: Some(vertex),
-            compilation_options: wgpu::PipelineCompilationOptions::default(),
-            buffers,
-        },
-        primitive: wgpu::PrimitiveState { topology, ..Default::default() },
-        depth_stencil: Some(wgpu::DepthStencilState {
-            format: DEPTH,
-            depth_write_enabled: Some(depth.write),
-            depth_compare: Some(depth.compare),
-            stencil: wgpu::StencilState::default(),
-            // Depth is reversed: less is farther away.
-            bias: if depth.behind {
-                wgpu::DepthBiasState { constant: -8, slope_scale: -1.0, clamp: 0.0 }
-            } else {
-                wgpu::DepthBiasState::default()
+/// What pipelines of the same shaders share: they are read and checked once.
+struct Stage {
+    module: wgpu::ShaderModule,
+    layout: wgpu::PipelineLayout,
+}
+
+impl Stage {
+    fn new(device: &wgpu::Device, source: &str, groups: &[&wgpu::BindGroupLayout]) -> Self {
+        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+            label: None,
+            source: wgpu::ShaderSource::Wgsl(source.into()),
+        });
+        let groups: Vec<_> = groups.iter().map(|group| Some(*group)).collect();
+        let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+            label: None,
+            bind_group_layouts: &groups,
+            immediate_size: 0,
+        });
+        Self { module, layout }
+    }
+
+    /// A pipeline with these entry points of a vertex and a fragment shader.
+    #[allow(
+        clippy::too_many_arguments,
+        reason = "a pipeline is made of so many things, each of its own type"
+    )]
+    fn pipeline(
+        &self,
+        device: &wgpu::Device,
+        target: Target,
+        [vertex, fragment]: [&str; 2],
+        kind: Kind,
+        buffers: &[Option<wgpu::VertexBufferLayout<'_>>],
+        depth: Depth,
+        topology: wgpu::PrimitiveTopology,
+    ) -> wgpu::RenderPipeline {
+        // Where a shader leaves out pixels, the GPU cannot tell beforehand which ones are hidden: so only where need be.
+        let constants = [("IN_SOME_PIXELS", 1.0)];
+        let constants = if kind == Kind::FadingCorners { &constants[..] } else { &[] };
+        device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
+            label: Some(vertex),
+            layout: Some(&self.layout),
+            vertex: wgpu::VertexState {
+                module: &self.module,
+                entry_point: Some(vertex),
+                compilation_options: wgpu::PipelineCompilationOptions::default(),
+                buffers,
             },
-        }),
-        multisample: wgpu::MultisampleState { count: target.samples, ..Default::default() },
-        fragment: Some(wgpu::FragmentState {
-            module: &module,
-            entry_point: Some(fragment),
-            compilation_options: wgpu::PipelineCompilationOptions::default(),
-            targets: &[Some(wgpu::ColorTargetState {
-                format: target.format,
-                blend: None,
-                write_mask: wgpu::ColorWrites::ALL,
-            })],
-        }),
-        multiview_mask: None,
-        cache: None,
-    })
+            primitive: wgpu::PrimitiveState { topology, ..Default::default() },
+            depth_stencil: Some(wgpu::DepthStencilState {
+                format: DEPTH,
+                depth_write_enabled: Some(depth.write),
+                depth_compare: Some(depth.compare),
+                stencil: wgpu::StencilState::default(),
+                // Depth is reversed: less is farther away.
+                bias: if depth.behind {
+                    wgpu::DepthBiasState { constant: -8, slope_scale: -1.0, clamp: 0.0 }
+                } else {
+                    wgpu::DepthBiasState::default()
+                },
+            }),
+            multisample: wgpu::MultisampleState { count: target.samples, ..Default::default() },
+            fragment: Some(wgpu::FragmentState {
+                module: &self.module,
+                entry_point: Some(fragment),
+                compilation_options: wgpu::PipelineCompilationOptions { constants, ..Default::default() },
+                targets: &[Some(wgpu::ColorTargetState {
+                    format: target.format,
+                    blend: None,
+                    write_mask: wgpu::ColorWrites::ALL,
+                })],
+            }),
+            multiview_mask: None,
+            cache: None,
+        })
+    }
 }

@@ -15,7 +15,7 @@ mod water;
 use super::pipelines::RECORD;
 use super::*;
 use crate::camera::FOV_Y;
-use crate::drawing::Moving;
+use crate::drawing::{Moving, Share};
 use crate::encoding::Encoding;
 use crate::morph::{self, Change, Moment, Morphs, Sight};
 use crate::picture::Picture;
@@ -151,7 +151,14 @@ impl World {
             let sides = (0..4)
                 .filter(|side| !children[*side].is_some_and(|c| split.contains(&c)))
                 .fold(0u8, |sides, side| sides | 1 << side);
-            DrawItem { layer: 0, diamond: *d, surface: Arc::clone(&self.surfaces[d]), sides, moving: None }
+            DrawItem {
+                layer: 0,
+                diamond: *d,
+                surface: Arc::clone(&self.surfaces[d]),
+                sides,
+                moving: None,
+                share: Share::ALL,
+            }
         });
         items.filter(|item| item.sides != 0).collect()
     }

@@ -82,9 +82,6 @@ pub enum TerrainError {
         /// The encoding asked for.
         asked: &'static str,
     },
-    /// Motions of irregular triangles.
-    #[error("motions from cut to cut are of points: leave --morph or --encoding tin out")]
-    Still,
     /// There is no such zone.
     #[error(
         "scene '{scene}' has no zone '{asked}'{}",

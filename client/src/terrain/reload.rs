@@ -62,9 +62,7 @@ impl Terrain {
     pub fn choose(&mut self, encoding: Encoding, zone: Option<String>) {
         self.reload = None;
         let is_so = encoding == self.encoding() && zone == self.options.zone;
-        // Triangles do not move.
-        let morph_seconds = if encoding == Encoding::Points { self.morph_seconds } else { 0.0 };
-        let mut options = Options { zone, morph_seconds, ..self.options.clone() };
+        let mut options = Options { zone, ..self.options.clone() };
         options.fetch.encoding = encoding;
         self.chosen = (!is_so).then_some(options);
     }
@@ -141,8 +139,8 @@ impl Terrain {
     /// Goes on as another version. What was counted counts on.
     fn become_next(&mut self, mut next: Self) {
         next.opened = self.opened;
-        if next.morph_seconds != self.morph_seconds {
-            next.set_morph_seconds(self.morph_seconds);
+        if next.morph_seconds() != self.morph_seconds() {
+            next.set_morph_seconds(self.morph_seconds());
         }
         next.traffic_before = self.traffic_before.plus(&self.fetcher.traffic());
         next.stats.reloads = self.stats.reloads + 1;

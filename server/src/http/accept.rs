@@ -136,7 +136,12 @@ impl Door {
             builder: Arc::clone(&self.builder),
             front: Arc::clone(&self.front),
             watcher: self.graceful.watcher(),
-            connection: Arc::new(Connection { activity: Activity::new(), from, outbox: Arc::clone(&outbox) }),
+            connection: Arc::new(Connection {
+                activity: Activity::new(),
+                from,
+                outbox: Arc::clone(&outbox),
+                answers: Arc::clone(&place.answers),
+            }),
             patience: self.patience,
         };
         let Ok(stream) = stream.into_std() else { return };
@@ -225,16 +230,25 @@ impl Visit {
 /// Places for connections, in all and by address.
 struct Places {
     all: Arc<Semaphore>,
-    by_address: Arc<Mutex<HashMap<IpAddr, u32>>>,
+    by_address: Arc<Mutex<HashMap<IpAddr, OfAddress>>>,
     most: u32,
     metrics: Arc<Metrics>,
 }
 
-/// One of them; free again once dropped.
+/// What an address has.
+struct OfAddress {
+    connections: u32,
+    /// Room for its answers under way. Over HTTP/1.1 a connection has one; without a bound, a few connections of HTTP/2 could
+    /// take all that there is for everybody.
+    answers: Arc<Semaphore>,
+}
+
+/// A place for a connection; free again once dropped.
 struct Place {
     _all: OwnedSemaphorePermit,
-    by_address: Arc<Mutex<HashMap<IpAddr, u32>>>,
+    by_address: Arc<Mutex<HashMap<IpAddr, OfAddress>>>,
     address: IpAddr,
+    answers: Arc<Semaphore>,
     metrics: Arc<Metrics>,
 }
 
@@ -248,14 +262,18 @@ impl Places {
     fn take(&self, address: IpAddr) -> Result<Place, &'static str> {
         let all = Arc::clone(&self.all).try_acquire_owned().map_err(|_| "connections")?;
         let mut by_address = self.by_address.lock().unwrap_or_else(PoisonError::into_inner);
-        let count = by_address.entry(address).or_insert(0);
-        if *count >= self.most {
+        let of_address = by_address.entry(address).or_insert_with(|| {
+            let answers = Arc::new(Semaphore::new(self.most as usize));
+            OfAddress { connections: 0, answers }
+        });
+        if of_address.connections >= self.most {
             return Err("connections_of_address");
         }
-        *count += 1;
+        of_address.connections += 1;
         self.metrics.connections.inc();
+        let answers = Arc::clone(&of_address.answers);
         let (by_address, metrics) = (Arc::clone(&self.by_address), Arc::clone(&self.metrics));
-        Ok(Place { _all: all, by_address, address, metrics })
+        Ok(Place { _all: all, by_address, address, answers, metrics })
     }
 }
 
@@ -263,9 +281,9 @@ impl Drop for Place {
     fn drop(&mut self) {
         self.metrics.connections.dec();
         let mut by_address = self.by_address.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(count) = by_address.get_mut(&self.address) {
-            *count -= 1;
-            if *count == 0 {
+        if let Some(of_address) = by_address.get_mut(&self.address) {
+            of_address.connections -= 1;
+            if of_address.connections == 0 {
                 by_address.remove(&self.address);
             }
         }

@@ -60,6 +60,8 @@ pub(super) struct Connection {
     pub(super) activity: Arc<Activity>,
     pub(super) from: SocketAddr,
     pub(super) outbox: Arc<Outbox>,
+    /// Room for answers under way to its address.
+    pub(super) answers: Arc<Semaphore>,
 }
 
 impl Front {
@@ -97,7 +99,7 @@ impl Front {
         let mut ended = Ended {
             metrics: Arc::clone(&self.site.metrics),
             answering: connection.activity.begin(),
-            place: None,
+            places: None,
             began: Instant::now(),
             from: connection.from,
             id: self.ids.of(request.headers().get(REQUEST_ID).and_then(|value| value.to_str().ok())),
@@ -111,8 +113,8 @@ impl Front {
         ended.metrics.in_flight.inc();
         let mut response = match self.admit(connection, &request) {
             Err(refused) => *refused,
-            Ok(place) => {
-                ended.place = place;
+            Ok(places) => {
+                ended.places = places;
                 match routes::at_once(&self.site, &request) {
                     Some(response) => response,
                     None => {
@@ -142,13 +144,14 @@ impl Front {
         response.map(|body| Body::new(Held { body, due, ended }))
     }
 
-    /// A place for the answer to a request, if it is one that this server answers and there is room. Who asks how the server is
+    /// Places for the answer to a request, of its address's and of all, if it is one that this server answers and there is
+    /// room. Who asks how the server is
     /// has to be told, above all when there is much to do: that takes no place, and counts for no rate.
     fn admit(
         &self,
         connection: &Connection,
         request: &Request<Incoming>,
-    ) -> Result<Option<OwnedSemaphorePermit>, Box<Response<Body>>> {
+    ) -> Result<Option<[OwnedSemaphorePermit; 2]>, Box<Response<Body>>> {
         let uri = request.uri();
         if self.stopping.load(Ordering::Relaxed) && uri.path() == "/ready" {
             let detail = "this server is about to stop";
@@ -184,11 +187,15 @@ impl Front {
                 return Err(Box::new(later(StatusCode::TOO_MANY_REQUESTS, detail, 1 + wait.as_secs())));
             }
         }
-        Arc::clone(&self.places).try_acquire_owned().map(Some).map_err(|_| {
-            self.site.metrics.rejected("in_flight");
-            let detail = "too much to do: ask again in a moment";
-            Box::new(later(StatusCode::SERVICE_UNAVAILABLE, detail, RETRY_AFTER))
-        })
+        let place = |places: &Arc<Semaphore>, reason| {
+            Arc::clone(places).try_acquire_owned().map_err(|_| {
+                self.site.metrics.rejected(reason);
+                let detail = "too much to do: ask again in a moment";
+                Box::new(later(StatusCode::SERVICE_UNAVAILABLE, detail, RETRY_AFTER))
+            })
+        };
+        let of_address = place(&connection.answers, "in_flight_of_address")?;
+        Ok(Some([of_address, place(&self.places, "in_flight")?]))
     }
 }
 
@@ -226,7 +233,7 @@ fn common_headers(headers: &mut HeaderMap, id: &str, seconds: f64) {
 struct Ended {
     metrics: Arc<Metrics>,
     answering: Answering,
-    place: Option<OwnedSemaphorePermit>,
+    places: Option<[OwnedSemaphorePermit; 2]>,
     began: Instant,
     from: SocketAddr,
     id: String,
@@ -249,7 +256,7 @@ impl Ended {
 impl Drop for Ended {
     fn drop(&mut self) {
         let seconds = self.began.elapsed().as_secs_f64();
-        self.place.take();
+        self.places.take();
         self.metrics.in_flight.dec();
         self.metrics.ended(self.route, self.sent, seconds);
         tracing::info!(

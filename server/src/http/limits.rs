@@ -11,7 +11,8 @@ pub struct Limits {
     /// Connections open at once; more are closed as they come
     #[arg(long, default_value_t = 4096, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub max_connections: u32,
-    /// Connections open at once from one address
+    /// Connections open at once from one address, and as many answers under way to it, of which HTTP/2 has several a
+    /// connection
     #[arg(long, default_value_t = 256, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub max_connections_per_address: u32,
     /// Answers under way at once; more are told to come back (503)

@@ -1,6 +1,7 @@
 //! Law 2 for irregular triangles: whatever is missing, they cover the forest once and fit along every side.
 
 use super::*;
+use crate::morph::{self, Change, Moment, Morphs};
 use std::collections::{BTreeMap, BTreeSet};
 
 type Place = [i64; 2];
@@ -128,6 +129,82 @@ fn any_cut_of_irregular_triangles_with_any_data_missing_fits_and_covers_the_fore
     assert!(fitting > 100_000 && levels.len() > 6, "{fitting} {levels:?}");
 }
 
+/// Splits that appear and go at all times, also before others have ended: whatever a pixel's number, what it sees fits, and is
+/// there once.
+#[test]
+fn whatever_appears_each_pixel_sees_a_cut_that_fits() {
+    let built = world()[0].tin.as_ref().unwrap();
+    let forest = built.layer.forest;
+    let all = tin_surfaces(built, |_| true);
+    let mut dice = Dice(71);
+    let mut morphs = Morphs::new(0.25);
+    let mut frame = 0;
+    let (mut mixed, mut turned) = (0, 0);
+    for round in 0..16 {
+        let camera = all_seeing(&mut dice);
+        let tolerance_pixels = 0.2 * 200f64.powf(dice.roll());
+        let ask = Ask {
+            layer: &built.layer,
+            encoding: Encoding::Tin,
+            ..ask(&world()[0], &camera, tolerance_pixels)
+        };
+        let ideal = choose(&ask, |d| Some(built.entries[&d]));
+        let wanted: Vec<Diamond> = ideal.splits().collect();
+        // Some rounds end half way.
+        for _ in 0..=(round * 5 % 12) {
+            frame += 1;
+            let now = Moment::at(f64::from(frame) * 0.25 / 8.0);
+            let cut = morphs.step(&Change {
+                layer: &built.layer,
+                now,
+                wanted: &wanted,
+                surface: &|d| all.get(&d).cloned(),
+                sight: &|_| morph::Sight { visible: true, error_metres: 1.0 },
+            });
+            assert!(cut.waiting.is_empty(), "what moves nothing waits for nothing");
+            let showing = show(0, &ask, &ideal, |d| Some(built.entries[&d]), &cut, now);
+            let share = |shown: &morph::Shown| shown.motion.as_ref().map_or(1.0, |motion| motion.share(now));
+            for number in [0.0, 0.07, 0.31, 0.5, 0.77, 0.999] {
+                let seen: HashSet<Diamond> = cut
+                    .shown
+                    .iter()
+                    .filter(|shown| share(shown) > number)
+                    .map(|shown| shown.diamond)
+                    .collect();
+                assert!(
+                    seen.iter().all(|d| forest.parents(*d).all(|p| seen.contains(&p))),
+                    "parents are there"
+                );
+                let is_seen = |item: &&DrawItem| (item.share.0[0]..item.share.0[1]).contains(&number);
+                let items: Vec<DrawItem> = showing.items.iter().filter(is_seen).cloned().collect();
+                assert_fit(&forest, &items);
+                let mut drawn: Vec<(Diamond, usize)> = Vec::new();
+                for item in &items {
+                    drawn.extend(
+                        (0..4).filter(|side| item.sides & 1 << side != 0).map(|side| (item.diamond, side)),
+                    );
+                }
+                let mut expected: Vec<(Diamond, usize)> = Vec::new();
+                for d in &seen {
+                    let is_finest = d.level() + 1 == forest.levels();
+                    let is_whole = |side: usize| match forest.children(*d)[side] {
+                        Some(child) => !seen.contains(&child) && !built.entries[&child].is_empty(),
+                        None => is_finest && (forest.local(*d).upper || side < 2),
+                    };
+                    expected.extend((0..4).filter(|side| is_whole(*side)).map(|side| (*d, side)));
+                }
+                drawn.sort_unstable();
+                expected.sort_unstable();
+                assert_eq!(drawn, expected, "in pixels of number {number}");
+            }
+            mixed += showing.items.iter().filter(|item| !item.share.is_all()).count();
+            turned += cut.held;
+        }
+    }
+    println!("{mixed} items in some of the pixels, {turned} diamonds go");
+    assert!(mixed > 1000 && turned > 100, "{mixed} {turned}");
+}
+
 #[test]
 fn a_crack_would_be_found() {
     let built = world()[0].tin.as_ref().unwrap();
@@ -139,6 +216,7 @@ fn a_crack_would_be_found() {
         surface: Arc::clone(&all[&d]),
         sides,
         moving: None,
+        share: Share::ALL,
     };
     // A child that is drawn as split beside a triangle that its parent still draws: what the cut never does.
     let d = forest.diamonds(1).find(|d| forest.local(*d).upper).unwrap();

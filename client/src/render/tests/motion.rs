@@ -1,6 +1,8 @@
 //! Cuts in motion: no crack and no jump at any moment.
 
 use super::*;
+use crate::{cut, sight};
+use diamantina_protocol::index::Entry;
 
 /// Seconds that a motion takes here, and frames in which it does.
 const SECONDS: f64 = 0.25;
@@ -219,6 +221,55 @@ fn a_motion_starts_as_the_picture_before_and_ends_as_the_one_after() {
             !all_at_once || changed < 1000 || (gone > changed / 20 && left > changed / 20),
             "{gone} {left} {changed}"
         );
+    }
+}
+
+/// Triangles that appear are seen in some pixels, and those whose place they take in the others.
+#[test]
+fn irregular_triangles_appear_pixel_by_pixel() {
+    let world = World::tin(Forest::new(6, 2, [2, 1]).unwrap(), 30.0, rough);
+    let camera = Camera { eye: world.place(0.5, -0.5, 1500.0), ..world.overhead([320, 240]) };
+    let draw = |items: &[DrawItem]| picture(&world, &camera, items, &PLAIN);
+    let ask = cut::Ask {
+        layer: &world.layer,
+        encoding: Encoding::Tin,
+        camera: &camera,
+        exaggeration: 1.0,
+        tolerance_pixels: 1.0,
+        sight: sight::Sight::default(),
+        seen: None,
+        memory_bytes: usize::MAX,
+        gpu: None,
+    };
+    let [low, high] = world.layer.heights.map(|h| (h / world.layer.quantum) as i32);
+    let entry = |_| Some(Entry { error_metres: 1.0, low, high, bytes: 1 });
+    for (from, to) in [(3, 4), (5, 6), (5, 4), (8, 7)] {
+        let [before, after]: [HashSet<Diamond>; 2] =
+            [from, to].map(|most| world.surfaces.keys().copied().filter(|d| d.level() < most).collect());
+        let [first, last] = [&before, &after].map(|split| draw(&world.cut(split)));
+        let changed = different(&first, &last, 3);
+        let mut play = Play::new(&world);
+        play.step(&before, |_| false);
+        let cut = play.step(&after, |_| true);
+        let at = |part: f64| {
+            let now = Moment::at((f64::from(play.frame) / f64::from(FRAMES) + part) * SECONDS);
+            draw(&cut::show(0, &ask, &cut::Ideal::default(), entry, &cut, now).items)
+        };
+        assert_eq!(different(&at(0.0), &first, 0), 0, "{from} to {to}: it begins as it was");
+        assert_eq!(different(&at(1.0), &last, 0), 0, "{from} to {to}: it ends as it is to be");
+        let half = at(0.5);
+        let pixels = half.pixels.chunks(4).zip(first.pixels.chunks(4).zip(last.pixels.chunks(4)));
+        let other = pixels.filter(|(half, (first, last))| half != first && half != last).count();
+        let [gone, left] = [&first, &last].map(|picture| different(&half, picture, 3));
+        println!(
+            "{from} to {to}: of {changed} pixels half way {gone} have changed and {left} have not, {other} are new"
+        );
+        assert!(
+            changed > 1000 && gone.abs_diff(left) < changed / 5,
+            "{from} to {to}: {gone} {left} {changed}"
+        );
+        // Where a silhouette is of a part of the triangles, what is behind may be seen.
+        assert!(other <= TOLERANCE, "{from} to {to}: {other}");
     }
 }
 
