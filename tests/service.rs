@@ -518,6 +518,7 @@ fn settings_come_from_files_variables_and_flags_through_the_real_program() {
     for (text, words) in [
         ("stors = []", "did you mean 'stores'?"),
         ("stores = [\"nowhere\"]", "nowhere"),
+        ("max_connections = 2\nmax-connections = 1", "'max-connections' and 'max_connections'"),
         ("rate = \"often\"", "often"),
         ("tokens = \"none\"", "no store"),
         ("x", "TOML"),
