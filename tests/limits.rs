@@ -1,6 +1,7 @@
 //! Who asks too much, too slowly or for nothing does not disturb the others.
 
-use crate::world::{World, serve_within};
+use crate::service::metric;
+use crate::world::{Served, World, serve_within};
 use diamantina_protocol::diamond::Diamond;
 use diamantina_server::http::Limits;
 use std::io::{self, Read, Write};
@@ -169,6 +170,11 @@ fn without_room_for_an_answer_one_is_told_when_to_come_back() {
     until_answered(&served.address, "/scenes", "200 OK");
 }
 
+/// How many were refused for a limit.
+fn rejections(served: &Served, reason: &str) -> f64 {
+    metric(served, &format!("diamantina_rejections_total{{reason=\"{reason}\"}}"))
+}
+
 #[test]
 fn requests_have_no_bodies_and_addresses_an_end() {
     let world = World::sample(129, 0.0);
@@ -192,6 +198,13 @@ fn requests_have_no_bodies_and_addresses_an_end() {
         let told = found.split_whitespace().nth(1);
         assert!(found.starts_with("HTTP/1.") && told == Some(status), "{status}: {found}");
     }
+    // That is counted once the connection has ended.
+    let started = Instant::now();
+    while ["head", "address"].map(|reason| rejections(&world.served, reason)) != [1.0; 2] {
+        assert!(started.elapsed() < PATIENCE, "a head that is too large is not counted");
+        sleep(milliseconds(20));
+    }
+    assert_eq!(rejections(&world.served, "body"), 2.0);
 }
 
 #[test]
