@@ -5,6 +5,7 @@ Called by scripts/objects: objects.py SERVER [--away SECONDS]
 """
 
 import argparse
+import collections
 import concurrent.futures
 import contextlib
 import http.client
@@ -515,10 +516,37 @@ class Trial:
             servers[1].stop(signal.SIGKILL)
             check(all(front.get(path)[2] == expected[path][2] for path in paths[:100]), "the cache is no use without servers")
             local.stop()
+            self.too_much(front, paths[0])
         finally:
             proxy.terminate()
             proxy.wait(10)
         return f"{len(paths)} requests, one of two servers killed"
+
+    def too_much(self, front, path):
+        """Of one address nginx takes so many requests at once, and so many a second; soon it is asked as before."""
+        with contextlib.ExitStack() as stack:
+            for _ in range(256):
+                held = stack.enter_context(socket.create_connection(("127.0.0.1", front.port)))
+                # It waits for the rest of the body, which never comes.
+                held.sendall(f"POST {path} HTTP/1.1\r\nHost: here\r\nContent-Length: 9\r\n\r\n".encode())
+            self.until(lambda: front.get(path)[0] == 503, "an address may have as many connections as it likes")
+        self.until(lambda: front.get(path)[0] == 200, "closed connections are counted for ever")
+        asked = f"HEAD {path} HTTP/1.1\r\nHost: here\r\n\r\n".encode() * 900
+        statuses = []
+        for _ in range(3):
+            with socket.create_connection(("127.0.0.1", front.port), timeout=30) as stream:
+                threading.Thread(target=stream.sendall, args=(asked,), daemon=True).start()
+                with stream.makefile("rb") as lines:
+                    heads = (line for line in lines if line.startswith(b"HTTP/1.1 "))
+                    statuses += [int(line.split()[1]) for _, line in zip(range(900), heads)]
+        check(set(statuses) == {200, 429}, f"2700 requests at once: {collections.Counter(statuses)}")
+        self.until(lambda: front.get(path)[0] == 200, "who asked too much is refused for ever")
+
+    def until(self, is_so, words):
+        due = time.monotonic() + 10
+        while not is_so():
+            check(time.monotonic() < due, words)
+            time.sleep(0.1)
 
     def end(self):
         for server in self.servers:
