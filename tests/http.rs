@@ -211,6 +211,14 @@ fn what_is_not_there_is_refused_in_words() {
         for (route, status, word) in [
             ("/nothing".to_owned(), 404, "/scenes"),
             ("/scenes/mars".to_owned(), 404, "/scenes"),
+            // Bytes that are no text.
+            ("/%ff".to_owned(), 404, "/scenes"),
+            ("/scenes/%ff".to_owned(), 404, "/scenes"),
+            ("/web/%ff/page.js".to_owned(), 404, "/scenes"),
+            ("/scenes/world/%ff/height?x=1&y=1".to_owned(), 404, "/scenes"),
+            (format!("/scenes/world/{v}/terrain/points/%ff/1"), 404, "/scenes"),
+            (format!("/scenes/world/{v}/terrain/points?d=%ff"), 400, "centre"),
+            (format!("/scenes/world/{v}/terrain/stream?%ff=1"), 400, "no parameter"),
             (format!("/scenes/world/{v}/water/index/0"), 404, "layer"),
             (format!("/scenes/world/{v}/terrain/index/{pages}"), 404, "pages 0 to"),
             (format!("/scenes/world/{v}/terrain/index/-1"), 404, "page"),

@@ -1,7 +1,7 @@
 //! Who asks too much, too slowly or for nothing does not disturb the others.
 
 use crate::service::metric;
-use crate::world::{World, serve_within};
+use crate::world::{Served, World, serve_within};
 use diamantina_protocol::diamond::Diamond;
 use diamantina_protocol::message;
 use diamantina_server::http::Limits;
@@ -227,7 +227,7 @@ fn one_address_cannot_take_all_the_room_for_answers() {
     request(&mut other, "/scenes");
     let found = answer(&mut other);
     assert!(found.contains("200 OK"), "{found}");
-    assert!(metric(&served, "diamantina_rejections_total{reason=\"in_flight_of_address\"}") >= 3.0);
+    assert!(rejections(&served, "in_flight_of_address") >= 3.0);
     assert_eq!(
         metric(&served, "diamantina_in_flight"),
         9.0,
@@ -235,11 +235,19 @@ fn one_address_cannot_take_all_the_room_for_answers() {
     );
 }
 
+/// How many were refused for a limit.
+fn rejections(served: &Served, reason: &str) -> f64 {
+    metric(served, &format!("diamantina_rejections_total{{reason=\"{reason}\"}}"))
+}
+
 #[test]
 fn requests_have_no_bodies_and_addresses_an_end() {
     let world = World::sample(129, 0.0);
     for (head, status) in [
         ("GET /health HTTP/1.1\r\n\r\n".to_owned(), "400"),
+        ("GET /health HTTP/1.1\r\nHost: here\r\nHost: there\r\n\r\n".to_owned(), "400"),
+        ("GET /health HTTP/1.0\r\nHost: here\r\nHost: there\r\n\r\n".to_owned(), "400"),
+        ("GET /health HTTP/1.0\r\n\r\n".to_owned(), "200"),
         ("GET /health HTTP/1.1\r\nHost: here\r\nContent-Length: 5\r\n\r\nhello".to_owned(), "413"),
         (
             "GET /health HTTP/1.1\r\nHost: here\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n".to_owned(),
@@ -252,8 +260,16 @@ fn requests_have_no_bodies_and_addresses_an_end() {
         // A server that has seen enough does not take the rest.
         let _ = stream.write_all(head.as_bytes());
         let found = answer(&mut stream);
-        assert!(found.starts_with(&format!("HTTP/1.1 {status}")), "{status}: {found}");
+        let told = found.split_whitespace().nth(1);
+        assert!(found.starts_with("HTTP/1.") && told == Some(status), "{status}: {found}");
     }
+    // That is counted once the connection has ended.
+    let started = Instant::now();
+    while ["head", "address"].map(|reason| rejections(&world.served, reason)) != [1.0; 2] {
+        assert!(started.elapsed() < PATIENCE, "a head that is too large is not counted");
+        sleep(milliseconds(20));
+    }
+    assert_eq!(rejections(&world.served, "body"), 2.0);
 }
 
 #[test]

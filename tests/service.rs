@@ -518,6 +518,7 @@ fn settings_come_from_files_variables_and_flags_through_the_real_program() {
     for (text, words) in [
         ("stors = []", "did you mean 'stores'?"),
         ("stores = [\"nowhere\"]", "nowhere"),
+        ("max_connections = 2\nmax-connections = 1", "'max-connections' and 'max_connections'"),
         ("rate = \"often\"", "often"),
         ("tokens = \"none\"", "no store"),
         ("x", "TOML"),
@@ -578,15 +579,24 @@ fn the_contract_tells_every_answer_that_is_given() {
     let none = |name: &str| if name == "scene" { "none".to_owned() } else { good(name) };
     let odd =
         |name: &str| if matches!(name, "x" | "page" | "layer") { "..%2f".to_owned() } else { good(name) };
+    let raw = |name: &str| if matches!(name, "scene" | "hash") { "%ff".to_owned() } else { good(name) };
     let long = format!("?d={}", "1,1;".repeat(500));
     let [x, y] = world.report.scene.layers[0].position([64, 64]);
     let place = format!("?x={x}&y={y}");
     let queries =
         ["", "?d=1,1;0,0", "?d=x", &long, "?error=1", "?error=-1", &place, "?x=a&y=1", "?lon=0&lat=0"];
     let mut seen = std::collections::BTreeSet::new();
+    assert_eq!(contract["components"]["securitySchemes"]["token"]["scheme"], "bearer");
     for (template, item) in paths {
         let responses = item["get"]["responses"].as_object().unwrap();
-        let values: [&dyn Fn(&str) -> String; 4] = [&good, &old, &none, &odd];
+        // Who has a token may send it wherever there may be a private scene.
+        let security = if template.starts_with("/scenes") {
+            serde_json::json!([{}, { "token": [] }])
+        } else {
+            ().into()
+        };
+        assert_eq!(item["get"]["security"], security, "{template}");
+        let values: [&dyn Fn(&str) -> String; 5] = [&good, &old, &none, &odd, &raw];
         for (values, query) in values.into_iter().flat_map(|v| queries.map(|q| (v, q))) {
             let route = filled(template, values, query);
             for method in [Method::GET, Method::HEAD, Method::DELETE] {
@@ -596,6 +606,14 @@ fn the_contract_tells_every_answer_that_is_given() {
                 let kind = answer.header("content-type").split(';').next().unwrap();
                 let any = told.get(kind).or(told.get("*/*"));
                 assert!(any.is_some(), "{method} {route}: {status} is {kind}, told: {told}");
+                if status == "200" && method == Method::GET {
+                    // Only of what has a tag it is told who has it.
+                    let is_tagged = !answer.header("etag").is_empty();
+                    assert_eq!(["304", "412"].map(|s| responses.contains_key(s)), [is_tagged; 2], "{route}");
+                }
+                if kind == "application/problem+json" {
+                    assert_eq!(answer.header("cache-control"), "no-store", "{method} {route}");
+                }
                 if method == Method::GET && kind == "application/problem+json" {
                     let problem: serde_json::Value = serde_json::from_slice(&answer.body).unwrap();
                     assert_eq!(problem["status"].to_string(), status);

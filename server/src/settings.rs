@@ -7,6 +7,7 @@ use crate::http::Limits;
 use crate::size::parse_bytes;
 use clap::parser::ValueSource;
 use clap::{Arg, ArgMatches, Args, Command, FromArgMatches, ValueEnum};
+use std::collections::HashMap;
 use std::ffi::{OsStr, OsString};
 use std::fmt::Write;
 use std::io::Read;
@@ -115,6 +116,16 @@ pub enum SettingsError {
         /// What is nearest to it.
         meant: Option<String>,
     },
+    /// The file says a setting twice, once with each way to write its name.
+    #[error("{path}: '{one}' and '{other}' are one setting: say it once")]
+    Twice {
+        /// The file.
+        path: PathBuf,
+        /// A name of it.
+        one: String,
+        /// The other.
+        other: String,
+    },
     /// A setting has another kind of value.
     #[error("{origin}: {reason}")]
     Value {
@@ -171,11 +182,15 @@ fn read(path: &Path, known: &[String]) -> Result<Vec<(String, Vec<String>)>, Set
         .parse()
         .map_err(|e: toml::de::Error| SettingsError::Toml { path: path.to_owned(), reason: e.to_string() })?;
     let mut found = Vec::new();
+    let mut names: HashMap<String, String> = HashMap::new();
     for (name, value) in table {
         let key = name.replace('-', "_");
         if !known.contains(&key) {
             let meant = nearest(&key, known);
             return Err(SettingsError::Unknown { path: path.to_owned(), key: name, meant });
+        }
+        if let Some(one) = names.insert(key.clone(), name.clone()) {
+            return Err(SettingsError::Twice { path: path.to_owned(), one, other: name });
         }
         let wrong = || SettingsError::Value {
             origin: format!("{}: {name}", path.display()),
@@ -403,6 +418,11 @@ mod tests {
             assert!(words.iter().all(|word| error.contains(word)), "{error} lacks one of {words:?}");
         };
         refused(&[], "max_conections = 1", &[], &["max_conections", "did you mean 'max_connections'?"]);
+        let twice = "max_connections = 2\nmax-connections = 1";
+        // Also where a flag would win over both.
+        for flags in [&[][..], &["--max-connections=3"]] {
+            refused(flags, twice, &[], &["'max_connections'", "'max-connections'", "once"]);
+        }
         refused(&[], "[limits]\nrate = 1", &[], &["no setting 'limits'"]);
         refused(&[], "rate = -1", &[], &["rate", "-1"]);
         refused(&[], "rate = 1.5", &[], &["rate", "whole number"]);

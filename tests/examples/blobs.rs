@@ -65,7 +65,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         for ((d, _), order) in diamonds.iter().zip(0..) {
             let payload = match bytes {
                 Some(bytes) => noise(&mut state, bytes),
-                None => real.get(key(d.centre()))?.ok_or("no such diamond")?,
+                None => real.get(key(d.centre()))?.ok_or("no such diamond")?.to_vec(),
             };
             writer.put(key(d.centre()), order, &payload)?;
         }

@@ -213,7 +213,7 @@ impl Visit {
     /// Answers what is asked on a connection, until it ends.
     async fn serve(self, stream: impl AsyncRead + AsyncWrite + Send + 'static) {
         let Self { builder, front, watcher, connection, patience } = self;
-        let from = connection.from;
+        let (from, metrics) = (connection.from, Arc::clone(front.metrics()));
         let io = TokioIo::new(Box::pin(Watched::new(stream, Arc::clone(&connection.activity), patience)));
         let service = service_fn(move |request| {
             let (front, connection) = (Arc::clone(&front), Arc::clone(&connection));
@@ -222,6 +222,10 @@ impl Visit {
         });
         let served = builder.serve_connection(io, service).into_owned();
         if let Err(error) = watcher.watch(served).await {
+            // Such a head never becomes a request that the front could count.
+            if error.downcast_ref::<hyper::Error>().is_some_and(hyper::Error::is_parse_too_large) {
+                metrics.rejected("head");
+            }
             tracing::debug!(%error, %from, "connection");
         }
     }

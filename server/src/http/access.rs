@@ -127,11 +127,15 @@ impl Access {
         let Some(path) = path else { return Ok(Self::default()) };
         let read_at = changed(path);
         let known = Known { read_at, seen_at: read_at, scenes: parse(path)? };
+        if known.scenes.is_empty() {
+            tracing::warn!(file = %path.display(), "no scene is named: all are everybody's");
+        }
         Ok(Self { path: Some(path.to_owned()), known: RwLock::new(known) })
     }
 
     /// Reads the file again if it has changed, once it has stayed the same from one look to the next: one that is being
-    /// written may be empty for a moment, and would make every scene everybody's. A bad one changes nothing.
+    /// written may be empty for a moment, and would make every scene everybody's. A bad one changes nothing, and neither does
+    /// one that names no scene any more: that is what is left of a file that was cut off, or of a secret that never came.
     pub(super) fn refresh(&self) {
         let Some(path) = &self.path else { return };
         let now = changed(path);
@@ -147,6 +151,11 @@ impl Access {
         let mut known = self.known.write().unwrap_or_else(PoisonError::into_inner);
         known.read_at = now;
         match read {
+            Ok(scenes) if scenes.is_empty() && !known.scenes.is_empty() => tracing::error!(
+                file = %path.display(),
+                "no scene is named any more: the tokens before go on; to make all scenes public, start the server without \
+                 --tokens"
+            ),
             Ok(scenes) => {
                 let before = std::mem::replace(&mut known.scenes, scenes);
                 for scene in known.scenes.keys().filter(|scene| !before.contains_key(*scene)) {
@@ -155,6 +164,9 @@ impl Access {
                         "is private from now on; caches may keep for a year what it has answered to everybody: purge \
                          them, or build it under another name"
                     );
+                }
+                for scene in before.keys().filter(|scene| !known.scenes.contains_key(*scene)) {
+                    tracing::warn!(scene, "is everybody's from now on: the file of tokens names it no more");
                 }
                 drop(known);
                 tracing::info!(file = %path.display(), "tokens were read again");
@@ -355,8 +367,13 @@ mod tests {
         assert!(!access.allows(Caller(None), "alps") && access.allows(caller, "alps"));
         write("alps", 2);
         assert!(!access.allows(Caller(None), "alps") && access.allows(caller, "alps"));
-        write("", 3);
-        assert!(access.allows(Caller(None), "alps"));
+        // A file that names nobody is one that was cut off.
+        for (minutes, text) in [(3, ""), (4, "# nobody\n\n")] {
+            write(text, minutes);
+            assert!(!access.allows(Caller(None), "alps") && access.allows(caller, "alps"), "{text:?}");
+        }
+        write(&format!("mars {hash}"), 5);
+        assert!(access.allows(Caller(None), "alps") && !access.allows(Caller(None), "mars"));
     }
 
     #[test]

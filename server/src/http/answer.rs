@@ -2,9 +2,12 @@
 
 use crate::store::StoreError;
 use axum::body::Body;
+use axum::extract::{self, FromRequestParts};
+use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use diamantina_protocol::message::Problem;
+use serde::de::DeserializeOwned;
 use std::sync::Arc;
 
 /// For what never changes.
@@ -89,6 +92,23 @@ impl From<StoreError> for Refusal {
             StoreError::Unread { .. } => Self::unread(&error),
             _ => Self::damaged(&error),
         }
+    }
+}
+
+/// There is nothing with this address.
+pub(super) fn no_address() -> Refusal {
+    Refusal::new(StatusCode::NOT_FOUND, "no such address: GET /scenes lists what there is")
+}
+
+/// What the parts of an address name: axum's own, but refused as all else is, where a part is no text.
+pub(super) struct Path<T>(pub(super) T);
+
+impl<T: DeserializeOwned + Send, S: Send + Sync> FromRequestParts<S> for Path<T> {
+    type Rejection = Refusal;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Refusal> {
+        let found = extract::Path::from_request_parts(parts, state).await;
+        found.map(|extract::Path(names)| Self(names)).map_err(|_| no_address())
     }
 }
 

@@ -3,6 +3,7 @@
 use utoipa::openapi::path::{
     HttpMethod, Operation, OperationBuilder, Parameter, ParameterBuilder, ParameterIn,
 };
+use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityRequirement, SecurityScheme};
 use utoipa::openapi::{
     Components, ContentBuilder, Info, ObjectBuilder, OpenApi, OpenApiBuilder, PathItem, Paths, Ref, RefOr,
     Required, Response, ResponseBuilder, Schema, Type,
@@ -14,6 +15,8 @@ pub(super) enum Holds {
     Text,
     Html,
     Json,
+    /// JSON that is made for each request, without a tag.
+    Computed,
     Octets,
     /// A tile of a texture.
     Picture,
@@ -52,6 +55,9 @@ pub(super) enum Form {
     Text,
 }
 
+/// The name of the scheme by which tokens come.
+const TOKEN: &str = "token";
+
 /// Statuses that any request may get.
 const ALWAYS: [u16; 5] = [405, 413, 414, 429, 503];
 
@@ -81,7 +87,7 @@ impl Holds {
         match self {
             Self::Text => "text/plain",
             Self::Html => "text/html",
-            Self::Json => "application/json",
+            Self::Json | Self::Computed => "application/json",
             Self::Octets => "application/octet-stream",
             Self::Picture => "image/webp",
             Self::Metrics => "application/openmetrics-text",
@@ -122,8 +128,13 @@ fn operation(template: &str, about: &About) -> Operation {
     for (name, is_required, form) in about.query {
         operation = operation.parameter(parameter(name, ParameterIn::Query, *is_required, *form));
     }
+    if template.starts_with("/scenes") {
+        // Scenes that are not private need none.
+        let token = SecurityRequirement::new(TOKEN, [""; 0]);
+        operation = operation.security(SecurityRequirement::default()).security(token);
+    }
     let schema = match about.holds {
-        Holds::Json => ObjectBuilder::new().schema_type(Type::Object),
+        Holds::Json | Holds::Computed => ObjectBuilder::new().schema_type(Type::Object),
         _ => ObjectBuilder::new().schema_type(Type::String),
     };
     let held = response(200, Some((about.holds.kind(), RefOr::T(schema.into()))));
@@ -159,10 +170,17 @@ pub(super) fn document<'a>(routes: impl Iterator<Item = (&'a str, &'a About)>) -
     let problem = ["title", "status", "detail"].into_iter().fold(problem, |p, name| p.required(name));
     let mut components = Components::new();
     components.schemas.insert("Problem".to_owned(), RefOr::T(problem.build().into()));
+    let bearer = HttpBuilder::new()
+        .scheme(HttpAuthScheme::Bearer)
+        .description(Some("Of a private scene. Without it such a scene is not there: 404, and in no list."))
+        .build();
+    components.security_schemes.insert(TOKEN.to_owned(), SecurityScheme::Http(bearer).into());
     let mut info = Info::new("Diamantina", env!("CARGO_PKG_VERSION"));
     info.description = Some(
         "Streams terrain. HEAD is answered wherever GET is. Refusals are problem+json (RFC 9457). What is below a \
-         version never changes; a version that another took the place of is refused with 410, which names it."
+         version never changes; a version that another took the place of is refused with 410, which names it. What is no \
+         HTTP is refused with 400, and a head above 32 KiB or with more than 100 fields with 431, before it is known what \
+         is asked for, and without a body."
             .to_owned(),
     );
     OpenApiBuilder::new().info(info).paths(paths).components(Some(components)).build()

@@ -157,8 +157,11 @@ impl Front {
             let detail = "this server is about to stop";
             return Err(Box::new(Refusal::new(StatusCode::SERVICE_UNAVAILABLE, detail).into_response()));
         }
-        if request.version() == Version::HTTP_11 && !request.headers().contains_key(header::HOST) {
-            let detail = "a request of HTTP/1.1 has a Host header (RFC 9112, section 3.2)";
+        // With two of them a proxy on the way may have gone by the other one.
+        let hosts = request.headers().get_all(header::HOST).iter().count();
+        if hosts > 1 || hosts == 0 && request.version() == Version::HTTP_11 {
+            let detail =
+                "a request of HTTP/1.1 has one Host header, and none has more (RFC 9112, section 3.2)";
             return Err(Box::new(Refusal::new(StatusCode::BAD_REQUEST, detail).into_response()));
         }
         if request.method() == Method::OPTIONS {

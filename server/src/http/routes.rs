@@ -2,7 +2,7 @@
 
 use super::Site;
 use super::access::Caller;
-use super::answer::{IMMUTABLE, IMMUTABLE_PRIVATE, OCTETS, Refusal, json, tagged};
+use super::answer::{IMMUTABLE, IMMUTABLE_PRIVATE, OCTETS, Path, Refusal, json, no_address, tagged};
 use super::blobs::Blob;
 use super::contract::{self, About, Form, Holds};
 use super::many::{self, Batch};
@@ -14,7 +14,7 @@ use crate::store::{Key, Kind, Store, zones};
 use crate::stream::Stream;
 use axum::Router;
 use axum::body::Body;
-use axum::extract::{Path, Query, State};
+use axum::extract::{Query, State};
 use axum::http::{HeaderMap, Method, Request, StatusCode, header};
 use axum::middleware::map_response;
 use axum::response::{Html, IntoResponse, Response};
@@ -67,7 +67,7 @@ const HEIGHT: About = About {
         ("lat", false, Form::Number),
     ],
     refusals: &[400, 404, 500],
-    ..about("The height at a place, x and y in metres or lon and lat in degrees", Holds::Json)
+    ..about("The height at a place, x and y in metres or lon and lat in degrees", Holds::Computed)
 };
 
 /// The routes of diamonds.
@@ -140,9 +140,7 @@ pub(super) fn router(site: Arc<Site>) -> Router {
         router = router.route(template, methods.layer(map_response(named)));
     }
     router
-        .fallback(|| async {
-            Refusal::new(StatusCode::NOT_FOUND, "no such address: GET /scenes lists what there is")
-        })
+        .fallback(|| async { no_address() })
         .method_not_allowed_fallback(|| async {
             let refusal = Refusal::new(StatusCode::METHOD_NOT_ALLOWED, "only GET and HEAD are answered");
             ([(header::ALLOW, "GET, HEAD, OPTIONS")], refusal)

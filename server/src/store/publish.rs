@@ -187,6 +187,17 @@ pub(super) async fn put(objects: &Objects, below: &str, bytes: Bytes) -> Result<
     if is_there(objects, below, bytes.len() as u64, &hash).await? {
         return Ok(false);
     }
+    send(objects, below, bytes, hash).await?;
+    Ok(true)
+}
+
+/// Puts an object in the place of what is there, whatever that says of itself.
+pub(super) async fn replace(objects: &Objects, below: &str, bytes: Bytes) -> Result<(), Failure> {
+    let hash = blake3::hash(&bytes).to_hex().to_string();
+    send(objects, below, bytes, hash).await
+}
+
+async fn send(objects: &Objects, below: &str, bytes: Bytes, hash: String) -> Result<(), Failure> {
     let name = objects.name(below);
     let attributes = Attributes::from_iter([
         (Attribute::ContentType, "application/octet-stream".to_owned()),
@@ -214,11 +225,10 @@ pub(super) async fn put(objects: &Objects, below: &str, bytes: Bytes) -> Result<
             }
             parts.finish().await.map(drop)
         })
-        .await?;
-    Ok(true)
+        .await
 }
 
-/// Whether there is an object with this content.
+/// Whether there is an object with this content, as far as it says itself.
 async fn is_there(objects: &Objects, below: &str, size: u64, hash: &str) -> Result<bool, Failure> {
     let name = objects.name(below);
     let options = GetOptions::new().with_head(true);

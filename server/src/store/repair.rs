@@ -151,8 +151,9 @@ impl Patient {
                 path.parent().map_or(Ok(()), sync_folder)
             }
             Self::Objects(objects) => {
-                let put = runtime()?.block_on(super::publish::put(objects, below, bytes.into()));
-                put.map(drop).map_err(|failure| failure.at(objects.address(below)))
+                // What is damaged may still have the size and the hash that it was sent with.
+                let put = runtime()?.block_on(super::publish::replace(objects, below, bytes.into()));
+                put.map_err(|failure| failure.at(objects.address(below)))
             }
         }
     }
