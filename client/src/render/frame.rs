@@ -187,8 +187,19 @@ mod tests {
                 .validate(&module)
                 .unwrap_or_else(|e| panic!("{}", e.emit_to_string_with_path(source, name)));
             assert_eq!(module.entry_points.len(), entries, "{name}");
-            for entry in &module.entry_points {
-                let text = translate(&module, &info, entry);
+            let entries = module.entry_points.iter().map(|entry| (entry.stage, entry.name.as_str()));
+            for (entry, in_some_pixels) in entries.flat_map(|entry| [(entry, 0.0), (entry, 1.0)]) {
+                let constants = [("IN_SOME_PIXELS".to_owned(), in_some_pixels)];
+                let constants = constants.into_iter().filter(|_| !module.overrides.is_empty()).collect();
+                let (module, info) = naga::back::pipeline_constants::process_overrides(
+                    &module,
+                    &info,
+                    Some(entry),
+                    &constants,
+                )
+                .unwrap();
+                let found = module.entry_points.iter().find(|found| found.name == entry.1).unwrap();
+                let text = translate(&module, &info, found);
                 assert!(text.contains("#version 300 es"));
                 // Version 3.10 has these, WebGL2 has not.
                 assert!(!["mix(uvec", "mix(ivec"].iter().any(|call| text.contains(call)), "{name}: {text}");
