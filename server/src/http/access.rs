@@ -54,6 +54,12 @@ pub enum TokensError {
         /// What is wrong with it.
         what: &'static str,
     },
+    /// It may have been cut off, or never have come: then all scenes would be everybody's.
+    #[error(
+        "{0}: no scene is named: expected lines SCENE HASH, as `diamantina-server token SCENE` prints them; where no scene is \
+         to be private, leave --tokens out"
+    )]
+    Nobody(PathBuf),
     /// There are too many.
     #[error("{0}: more than {TOKENS_MAX} lines, or {FILE_BYTES_MAX} bytes")]
     Many(PathBuf),
@@ -95,7 +101,7 @@ fn parse(path: &Path) -> Result<HashMap<String, Vec<Hash>>, TokensError> {
         let hash = blake3::Hash::from_hex(word).map_err(|_| wrong("its second word is no hash"))?;
         scenes.entry(scene.to_owned()).or_default().push(*hash.as_bytes());
     }
-    Ok(scenes)
+    if scenes.is_empty() { Err(TokensError::Nobody(path.to_owned())) } else { Ok(scenes) }
 }
 
 fn changed(path: &Path) -> Option<SystemTime> {
@@ -127,9 +133,6 @@ impl Access {
         let Some(path) = path else { return Ok(Self::default()) };
         let read_at = changed(path);
         let known = Known { read_at, seen_at: read_at, scenes: parse(path)? };
-        if known.scenes.is_empty() {
-            tracing::warn!(file = %path.display(), "no scene is named: all are everybody's");
-        }
         Ok(Self { path: Some(path.to_owned()), known: RwLock::new(known) })
     }
 
@@ -151,11 +154,6 @@ impl Access {
         let mut known = self.known.write().unwrap_or_else(PoisonError::into_inner);
         known.read_at = now;
         match read {
-            Ok(scenes) if scenes.is_empty() && !known.scenes.is_empty() => tracing::error!(
-                file = %path.display(),
-                "no scene is named any more: the tokens before go on; to make all scenes public, start the server without \
-                 --tokens"
-            ),
             Ok(scenes) => {
                 let before = std::mem::replace(&mut known.scenes, scenes);
                 for scene in known.scenes.keys().filter(|scene| !before.contains_key(*scene)) {
@@ -344,12 +342,16 @@ mod tests {
             let error = Access::open(Some(path.path())).unwrap_err().to_string();
             assert!(error.contains(&format!("line {line}:")), "{error}");
         }
+        for text in ["", "# nobody\n\n"] {
+            let error = Access::open(Some(file(text).path())).unwrap_err().to_string();
+            assert!(error.contains("no scene is named") && error.contains("leave --tokens out"), "{error}");
+        }
     }
 
     #[test]
     fn tokens_are_read_again_and_a_bad_file_changes_nothing() {
         let (token, hash) = new_token().unwrap();
-        let file = file("");
+        let file = file(&format!("mars {hash}"));
         let access = Access::open(Some(file.path())).unwrap();
         let caller = access.caller(&headers(&format!("Bearer {token}")));
         let write = |text: &str, minutes: u64| {

@@ -6,7 +6,9 @@
 //! size and hash is not sent again. Versions before stay, since servers may still be at them, until they are pruned.
 
 use super::objects::{Failure, Manner, Objects, runtime};
-use super::{Manifest, SCENE_BYTES_MAX, SCENE_FILE, StoreError, folder, io_at, is_version, pack_name};
+use super::{
+    Key, Manifest, Place, SCENE_BYTES_MAX, SCENE_FILE, StoreError, folder, io_at, is_version, pack_name,
+};
 use bytes::Bytes;
 use diamantina_protocol::message::Scene;
 use futures_util::TryStreamExt;
@@ -14,8 +16,10 @@ use object_store::{
     Attribute, Attributes, GetOptions, ObjectStoreExt, PutMode, PutMultipartOptions, PutOptions,
     UpdateVersion, WriteMultipart,
 };
+use std::collections::HashMap;
 use std::fs;
 use std::path::Path;
+use xxhash_rust::xxh3::xxh3_64;
 
 /// What is larger goes in parts, each of which can be tried again alone.
 const PART_BYTES: usize = 8 << 20;
@@ -79,7 +83,7 @@ impl Publisher {
     /// no. With `prune`, versions but this one and the one before are removed then.
     ///
     /// # Errors
-    /// When the folder holds no store, the object store fails, or somebody else has published there
+    /// When the folder holds no store or a damaged one, the object store fails, or somebody else has published there
     /// ([`StoreError::Overtaken`]): what is published is then as it was.
     pub fn publish(
         &self,
@@ -90,14 +94,26 @@ impl Publisher {
         let root = folder(root);
         let manifest = Manifest::read(root)?;
         let version = manifest.scene.version.clone();
-        let names = (0..manifest.pack_bytes.len()).map(pack_name).chain(["directory".to_owned()]);
+        let directory = root.join(&version).join("directory");
+        let places =
+            manifest.places(&fs::read(&directory).map_err(io_at("read", &directory))?, &directory)?;
+        let mut by_pack: HashMap<u32, Vec<(Key, Place)>> = HashMap::new();
+        for (key, place) in places {
+            by_pack.entry(place.pack).or_default().push((key, place));
+        }
+        let packs = (0..).zip(&manifest.pack_bytes).map(|(number, bytes)| {
+            (pack_name(number as usize), Some((*bytes, by_pack.remove(&number).unwrap_or_default())))
+        });
         let (mut sent, mut kept, mut last) = (0, 0, 0);
-        for name in names {
+        for (name, expected) in packs.chain([("directory".to_owned(), None)]) {
             if !go_on(last) {
                 return Ok(None);
             }
             let path = root.join(&version).join(&name);
             let bytes = Bytes::from(fs::read(&path).map_err(io_at("read", &path))?);
+            if let Some((length, blobs)) = expected {
+                check(&path, &bytes, length, &blobs)?;
+            }
             last = bytes.len() as u64;
             let below = format!("{version}/{name}");
             let put = runtime()?.block_on(put(&self.objects, &below, bytes));
@@ -228,6 +244,24 @@ async fn send(objects: &Objects, below: &str, bytes: Bytes, hash: String) -> Res
         .await
 }
 
+/// Whether a pack is as it was written: servers that go over to a new version read one blob of each alone.
+fn check(path: &Path, pack: &[u8], length: u64, blobs: &[(Key, Place)]) -> Result<(), StoreError> {
+    let damaged = |what: String| {
+        let what = format!("{what}: mend it from a copy with `diamantina-server repair`, or build it again");
+        Err(StoreError::Damaged { path: path.to_owned(), what })
+    };
+    if pack.len() as u64 != length {
+        return damaged(format!("has {} bytes, expected {length}", pack.len()));
+    }
+    for (key, place) in blobs {
+        let start = place.offset as usize;
+        if pack.get(start..start + place.bytes as usize).is_none_or(|blob| xxh3_64(blob) != place.checksum) {
+            return damaged(format!("{key:?} at byte {start} does not match its checksum"));
+        }
+    }
+    Ok(())
+}
+
 /// Whether there is an object with this content, as far as it says itself.
 async fn is_there(objects: &Objects, below: &str, size: u64, hash: &str) -> Result<bool, Failure> {
     let name = objects.name(below);
@@ -247,4 +281,33 @@ async fn is_there(objects: &Objects, below: &str, size: u64, hash: &str) -> Resu
     // Somebody else's tool has put it there.
     let bytes = objects.read_long(below, PIECE_BYTES).await?;
     Ok(blake3::hash(&bytes).to_hex().as_str() == hash)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::store::Kind;
+
+    #[test]
+    fn a_pack_with_a_wrong_byte_or_one_too_many_or_too_few_is_damaged() {
+        let pack = b"one and another";
+        let blob = |offset: u32, bytes: u32| {
+            let key = Key { layer: 0, kind: Kind::Points, a: offset, b: 0 };
+            let checksum = xxh3_64(&pack[offset as usize..][..bytes as usize]);
+            (key, Place { pack: 0, offset, bytes, checksum })
+        };
+        let blobs = [blob(0, 4), blob(4, 11)];
+        let told = |bytes: &[u8]| {
+            check(Path::new("pack"), bytes, pack.len() as u64, &blobs).map_err(|error| error.to_string())
+        };
+        assert_eq!(told(pack), Ok(()));
+        for at in 0..pack.len() {
+            let mut other = *pack;
+            other[at] ^= 1;
+            assert!(told(&other).unwrap_err().contains("checksum"), "{at}");
+        }
+        for other in [&pack[..14], b"one and another.", b""] {
+            assert!(told(other).unwrap_err().contains("expected 15"));
+        }
+    }
 }

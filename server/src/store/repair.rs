@@ -103,6 +103,16 @@ pub fn repair(root: &Path, from: Option<&Path>, advance: impl Fn(u64)) -> Result
         report.mended += sound.len();
         if !sound.is_empty() {
             patient.mend(&below, bytes, &sound)?;
+        } else if wrong.is_empty()
+            && let Some(found) = patient.other_length(&below, bytes)?
+        {
+            // All blobs are sound, but no store with such a pack is opened.
+            if copy.is_some() {
+                patient.mend(&below, bytes, &[])?;
+                report.mended += 1;
+            } else {
+                report.lost.push(format!("the end of {below}: {found} bytes, expected {bytes}"));
+            }
         }
         advance(blobs.len() as u64);
     }
@@ -221,7 +231,16 @@ impl Patient {
         }
     }
 
-    /// Writes blobs to their places in a pack.
+    /// The length of a pack in a folder, if it is not the one that it was written with. Those of object stores count as
+    /// wrong as a whole then.
+    fn other_length(&self, below: &str, bytes: u64) -> Result<Option<u64>, StoreError> {
+        let Self::Folder(root) = self else { return Ok(None) };
+        let path = root.join(below);
+        let found = fs::metadata(&path).map_err(io_at("read", &path))?.len();
+        Ok(Some(found).filter(|found| *found != bytes))
+    }
+
+    /// Writes blobs to their places in a pack, which has its length then.
     fn mend(&self, below: &str, bytes: u64, blobs: &[(Place, Bytes)]) -> Result<(), StoreError> {
         if let Self::Folder(root) = self {
             let path = root.join(below);
@@ -395,13 +414,18 @@ mod tests {
         let untouched = repair(&store, Some(&copy), |_| {}).unwrap();
         assert_eq!((untouched.blobs, untouched.mended, untouched.lost.len()), (100, 0, 0));
         type Damage = fn(&Path);
-        let harms: [(&str, Damage); 4] = [
+        let harms: [(&str, Damage); 5] = [
             ("pack-00000", |p| {
                 let file = File::options().write(true).open(p).unwrap();
                 file.write_all_at(b"xyz", 17).unwrap();
                 file.write_all_at(b"xyz", 9_000_000).unwrap();
             }),
             ("pack-00001", |p| File::options().write(true).open(p).unwrap().set_len(1000).unwrap()),
+            ("pack-00001", |p| {
+                // A byte too many, and all else as it was.
+                let file = File::options().write(true).open(p).unwrap();
+                file.set_len(file.metadata().unwrap().len() + 1).unwrap();
+            }),
             ("pack-00001", |p| fs::remove_file(p).unwrap()),
             ("directory", |p| fs::write(p, "x").unwrap()),
         ];
