@@ -80,7 +80,8 @@ struct DoctorArgs {
 struct ViewerArgs {
     #[command(flatten)]
     view: ViewArgs,
-    /// Seconds that points take to move where the level of detail changes [default: 0.3, and 0 with --true]
+    /// Seconds that the ground takes to change where the level of detail does: points move, triangles appear [default: 0.3, and
+    /// 0 with --true]
     #[arg(long, value_name = "SECONDS")]
     morph: Option<f64>,
     /// Keep nothing on the disk
@@ -208,7 +209,8 @@ struct FlyArgs {
     /// alone, and flights can be compared
     #[arg(long, value_name = "SECONDS")]
     settle: Option<f64>,
-    /// Seconds of the path that the surface takes to move whenever its level of detail changes, up to 60; 0: it jumps
+    /// Seconds of the path that the ground takes to change where its level of detail does, up to 60: points move, triangles
+    /// appear; 0: it jumps
     #[arg(long, default_value_t = 0.0, value_name = "SECONDS")]
     morph: f64,
     #[command(flatten)]

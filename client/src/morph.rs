@@ -172,7 +172,7 @@ impl Motion {
     /// The part of the picture's pixels in which a split of irregular triangles is seen, from 0 to 1: in the others the parents'
     /// surface is. Each pixel has a number, and the split is seen where that is below this share.
     ///
-    /// A diamond has no less of it than its children, which begin later and end sooner. So whatever a pixel's number is, the
+    /// A diamond has no less of it than its children, which begin after it, and go before it. So whatever a pixel's number is, the
     /// splits that it sees hold the parents of each, and are a cut without cracks like any other. Points appear at once.
     #[must_use]
     pub fn share(&self, now: Moment) -> f32 {
@@ -622,20 +622,22 @@ impl Start<'_> {
         for (parent, bit) in self.parents.iter().zip([0, PARENT]) {
             let Some(points) = parent.surface.points() else { continue };
             let (heights, normals) = (points.block().heights(), points.normals());
+            let still = |from: usize| (0.0, normals[from]);
             let (forest, d, at) = (self.forest, self.d, parent.diamond);
             if let Some(motion) = parent.motion {
-                walk_shared(forest, d, at, |to, from| sources[to] = bit | from as Source);
-                if way == Way::Out {
-                    walk_shared(forest, d, at, |to, from| {
-                        let (lift, normal) = self.drawn(&motion.records[from]);
-                        before[to] = Before { height: heights[from], lift, normal };
-                    });
-                    continue;
-                }
-            }
-            if is_needed {
                 walk_shared(forest, d, at, |to, from| {
-                    before[to] = Before { height: heights[from], lift: 0.0, normal: normals[from] };
+                    sources[to] = bit | from as Source;
+                    if is_needed {
+                        let is_now = way == Way::Out;
+                        let (lift, normal) =
+                            if is_now { self.drawn(&motion.records[from]) } else { still(from) };
+                        before[to] = Before { height: heights[from], lift, normal };
+                    }
+                });
+            } else if is_needed {
+                walk_shared(forest, d, at, |to, from| {
+                    let (lift, normal) = still(from);
+                    before[to] = Before { height: heights[from], lift, normal };
                 });
             }
         }

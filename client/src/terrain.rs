@@ -315,7 +315,7 @@ impl Terrain {
         }
     }
 
-    /// Seconds that points take to move where the level of detail changes.
+    /// Seconds that points take to move, and triangles to appear, where the level of detail changes.
     #[must_use]
     pub fn morph_seconds(&self) -> f64 {
         self.options.morph_seconds

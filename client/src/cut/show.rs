@@ -78,7 +78,7 @@ pub fn show(
             let all = if forest.local(d).upper { 0b1111 } else { 0b11 };
             sides = if seen(d).in_view { all } else { 0 };
         }
-        let share = share(shown);
+        let share = split[&d];
         let mut item = |sides: u8, from: f32| {
             let moves = shown.surface.points().is_some();
             let moving = shown.motion.clone().filter(|_| moves).map(|motion| Moving { motion, now });

@@ -115,7 +115,10 @@ pub(super) fn terrain_pipelines(
             Mode::Lines => wgpu::PrimitiveTopology::LineList,
             _ => wgpu::PrimitiveTopology::TriangleList,
         };
-        stage.pipeline(device, target, [vertex, fragment], kind, buffers, depth, topology)
+        // Where a shader leaves out pixels, the GPU cannot tell beforehand which ones are hidden: so only where need be.
+        let constants = [("IN_SOME_PIXELS", 1.0)];
+        let constants = if kind == Kind::FadingCorners { &constants[..] } else { &[] };
+        stage.pipeline(device, target, [vertex, fragment], constants, buffers, depth, topology)
     };
     [
         made(Kind::Points, "terrain_vertex", &points[..3]),
@@ -143,15 +146,7 @@ pub(super) fn sky_pipeline(
     let entries = ["sky_vertex", "sky_fragment"];
     let depth = Depth { compare: wgpu::CompareFunction::GreaterEqual, write: false, behind: false };
     let topology = wgpu::PrimitiveTopology::TriangleList;
-    Stage::new(device, SKY_WGSL, &[frame]).pipeline(
-        device,
-        target,
-        entries,
-        Kind::Points,
-        &[],
-        depth,
-        topology,
-    )
+    Stage::new(device, SKY_WGSL, &[frame]).pipeline(device, target, entries, &[], &[], depth, topology)
 }
 
 /// What pipelines of the same shaders share: they are read and checked once.
@@ -175,7 +170,7 @@ impl Stage {
         Self { module, layout }
     }
 
-    /// A pipeline with these entry points of a vertex and a fragment shader.
+    /// A pipeline with these entry points of a vertex and a fragment shader, and these of the latter's constants set.
     #[allow(
         clippy::too_many_arguments,
         reason = "a pipeline is made of so many things, each of its own type"
@@ -185,14 +180,11 @@ impl Stage {
         device: &wgpu::Device,
         target: Target,
         [vertex, fragment]: [&str; 2],
-        kind: Kind,
+        constants: &[(&str, f64)],
         buffers: &[Option<wgpu::VertexBufferLayout<'_>>],
         depth: Depth,
         topology: wgpu::PrimitiveTopology,
     ) -> wgpu::RenderPipeline {
-        // Where a shader leaves out pixels, the GPU cannot tell beforehand which ones are hidden: so only where need be.
-        let constants = [("IN_SOME_PIXELS", 1.0)];
-        let constants = if kind == Kind::FadingCorners { &constants[..] } else { &[] };
         device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
             label: Some(vertex),
             layout: Some(&self.layout),

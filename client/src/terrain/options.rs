@@ -21,7 +21,7 @@ pub struct Options {
     /// GPU memory for the surfaces that are drawn and for their motions, in bytes. Where it is too little for the tolerance, the
     /// largest errors are reduced first; where it is too little for motions, points jump.
     pub gpu_bytes: u64,
-    /// Seconds that points take to move from one cut to the next, at most [`morph::SECONDS_MAX`]; 0: they jump.
+    /// Seconds that points take to move, and triangles to appear, from one cut to the next, at most [`morph::SECONDS_MAX`]; 0: they jump.
     pub morph_seconds: f64,
     /// The names of the layers to stream and draw; none: all.
     pub layers: Option<Vec<String>>,

@@ -12,7 +12,7 @@ const SAMPLES: usize = 200;
 /// Cells of the finest layer that two places of a profile are apart at least.
 const APART_CELLS: f64 = 0.1;
 
-/// Frames after which a profile is looked at again while data arrives or the eye moves.
+/// Frames after which a profile is looked at again while data arrives for the first time.
 const FRAMES: u32 = 20;
 
 /// A place that was clicked.
@@ -90,7 +90,9 @@ pub(super) fn follow(viewer: &mut Viewer) -> bool {
     let profile = &mut viewer.profile;
     profile.age += 1;
     let stands = profile.eye.replace(camera) == Some(camera);
-    let is_due = profile.age >= FRAMES || (viewer.frame.complete && stands);
+    // On the way to another view the ground is drawn as coarse as may be: once all was there, that tells nothing better.
+    let is_glimpse_due = profile.age >= FRAMES && profile.seen_from.is_none();
+    let is_due = is_glimpse_due || (viewer.frame.complete && stands);
     let is_new = profile.ends != ends;
     if !is_new && (profile.seen_from == Some(camera) || !is_due) {
         return profile.seen_from != Some(camera);

@@ -20,6 +20,7 @@ use std::collections::HashMap;
 use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
+use xxhash_rust::xxh3::xxh3_64;
 
 /// The format that this build writes, and the only one that it reads.
 pub const FORMAT: u32 = 3;
@@ -61,6 +62,19 @@ pub(super) struct Place {
     pub(super) offset: u32,
     pub(super) bytes: u32,
     pub(super) checksum: u64,
+}
+
+impl Place {
+    /// Whether a blob is the one that was written there.
+    pub(super) fn is_of(&self, blob: &[u8]) -> bool {
+        xxh3_64(blob) == self.checksum
+    }
+
+    /// Whether a whole pack has the blob there as it was written.
+    pub(super) fn is_sound_in(&self, pack: &[u8]) -> bool {
+        let start = self.offset as usize;
+        pack.get(start..start + self.bytes as usize).is_some_and(|blob| self.is_of(blob))
+    }
 }
 
 fn kind_code(kind: Kind) -> u8 {

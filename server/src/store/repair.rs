@@ -21,7 +21,6 @@ use std::fs::{self, File};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use xxhash_rust::xxh3::xxh3_64;
 
 /// Blobs that are asked of another copy at once.
 const AT_ONCE: usize = 64;
@@ -200,12 +199,6 @@ impl Patient {
 
     /// The blobs of a pack that are not as they were written.
     fn wrong(&self, below: &str, bytes: u64, blobs: &Found) -> Result<Found, StoreError> {
-        let is_wrong =
-            |blob: Option<&[u8]>, place: &Place| blob.is_none_or(|blob| xxh3_64(blob) != place.checksum);
-        let slice = |whole: &[u8], place: &Place| -> bool {
-            let [start, length] = [place.offset as usize, place.bytes as usize];
-            is_wrong(whole.get(start..start + length), place)
-        };
         match self {
             Self::Folder(root) => {
                 // One by one: where a disk fails it fails in places.
@@ -217,13 +210,13 @@ impl Patient {
                 };
                 Ok(blobs
                     .iter()
-                    .filter(|(_, place)| is_wrong(read(place).as_deref(), place))
+                    .filter(|(_, place)| read(place).is_none_or(|blob| !place.is_of(&blob)))
                     .copied()
                     .collect())
             }
             Self::Objects(_) => match self.read(below) {
                 Ok(whole) if whole.len() as u64 <= bytes => {
-                    Ok(blobs.iter().filter(|(_, place)| slice(&whole, place)).copied().collect())
+                    Ok(blobs.iter().filter(|(_, place)| !place.is_sound_in(&whole)).copied().collect())
                 }
                 Ok(_) | Err(StoreError::Damaged { .. }) => Ok(blobs.clone()),
                 Err(error) => Err(error),
@@ -301,7 +294,7 @@ impl Copy {
                 let mut found = HashMap::new();
                 for ((key, place), blob) in wanted.iter().zip(store.get_many(&keys)) {
                     match blob {
-                        Ok(Some(blob)) if xxh3_64(&blob) == place.checksum => drop(found.insert(*key, blob)),
+                        Ok(Some(blob)) if place.is_of(&blob) => drop(found.insert(*key, blob)),
                         // The copy may be damaged, too.
                         Ok(_) | Err(StoreError::Damaged { .. } | StoreError::Unread { .. }) => {}
                         Err(error) => return Err(error),
@@ -322,7 +315,7 @@ impl Copy {
                     let mut found = HashMap::new();
                     while let Some((key, place, read)) = answers.next().await {
                         if let Ok(thing) = read
-                            && xxh3_64(&thing.bytes) == place.checksum
+                            && place.is_of(&thing.bytes)
                         {
                             found.insert(key, thing.bytes);
                         }

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::morph::{self, Change, Moment, Morphs};
+use crate::world::BuiltTin;
 use std::collections::{BTreeMap, BTreeSet};
 
 type Place = [i64; 2];
@@ -90,6 +91,12 @@ fn area(forest: &Forest, items: &[DrawItem]) -> i64 {
     items.iter().map(|item| i64::from(item.sides.count_ones()) * quarter(item.diamond)).sum()
 }
 
+/// What is asked of a view that sees all, at any tolerance.
+fn any_ask<'a>(built: &'a BuiltTin, camera: &'a Camera, dice: &mut Dice) -> Ask<'a> {
+    let tolerance_pixels = 0.2 * 200f64.powf(dice.roll());
+    Ask { layer: &built.layer, encoding: Encoding::Tin, ..ask(&world()[0], camera, tolerance_pixels) }
+}
+
 #[test]
 fn any_cut_of_irregular_triangles_with_any_data_missing_fits_and_covers_the_forest_once() {
     let built = world()[0].tin.as_ref().unwrap();
@@ -99,12 +106,7 @@ fn any_cut_of_irregular_triangles_with_any_data_missing_fits_and_covers_the_fore
     let (mut fitting, mut levels) = (0, BTreeSet::new());
     for round in 0..40 {
         let camera = all_seeing(&mut dice);
-        let tolerance_pixels = 0.2 * 200f64.powf(dice.roll());
-        let ask = Ask {
-            layer: &built.layer,
-            encoding: Encoding::Tin,
-            ..ask(&world()[0], &camera, tolerance_pixels)
-        };
+        let ask = any_ask(built, &camera, &mut dice);
         let ideal = choose(&ask, |d| Some(built.entries[&d]));
         let chance = if round % 4 == 0 { 1.0 } else { 0.5 + 0.5 * dice.roll() };
         let arrived: HashSet<Diamond> =
@@ -142,12 +144,7 @@ fn whatever_appears_each_pixel_sees_a_cut_that_fits() {
     let (mut mixed, mut turned) = (0, 0);
     for round in 0..16 {
         let camera = all_seeing(&mut dice);
-        let tolerance_pixels = 0.2 * 200f64.powf(dice.roll());
-        let ask = Ask {
-            layer: &built.layer,
-            encoding: Encoding::Tin,
-            ..ask(&world()[0], &camera, tolerance_pixels)
-        };
+        let ask = any_ask(built, &camera, &mut dice);
         let ideal = choose(&ask, |d| Some(built.entries[&d]));
         let wanted: Vec<Diamond> = ideal.splits().collect();
         // Some rounds end half way.
