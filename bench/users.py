@@ -28,7 +28,7 @@ class Server:
         many = "20000"
         self.process = subprocess.Popen(
             [program, "serve", store, "--listen", f"127.0.0.1:{self.port}", "--rate", "0",
-             "--max-connections", many, "--max-connections-per-address", many],
+             "--max-connections", many, "--max-connections-per-address", many, "--max-in-flight", many],
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         for _ in range(100):
             try:

@@ -1,10 +1,13 @@
 //! `load`: many users find a server well, and what is wrong on the way is counted.
 
 use crate::hostile::end;
-use crate::world::{Faults, Proxy, World, programs};
+use crate::world::{Faults, Proxy, World, build, options as options_of_build, programs, serve_within};
 use diamantina_client::encoding::Encoding;
 use diamantina_client::load::{Options, Report, run};
+use diamantina_server::http::Limits;
+use diamantina_server::{hierarchy, ingest, sample};
 use std::process::{Command, Stdio};
+use std::thread;
 use std::time::Duration;
 
 fn options(users: u32) -> Options {
@@ -49,6 +52,30 @@ fn triangles_load_a_server_as_well() {
     let world = World::whole_with_triangles(257);
     let report = load(&world.served.scene("world"), &Options { encoding: Encoding::Tin, ..options(6) });
     assert!(report.errors.is_empty() && report.views.count > 0 && report.decoded.0 > 0, "{report:?}");
+}
+
+#[test]
+fn users_go_over_to_the_version_that_takes_the_place_of_theirs() {
+    let folder = tempfile::tempdir().unwrap();
+    let (dem, store) = (folder.path().join("dem.tif"), folder.path().join("store"));
+    sample::write(&dem, 257).unwrap();
+    let make = |max_error: f64| {
+        let options = hierarchy::Options { max_error, ..options_of_build() };
+        build(&dem, &store, &ingest::Options::default(), &options)
+    };
+    make(4.0);
+    let limits = Limits { reload: 1, grace: 0, ..Limits::default() };
+    let served = serve_within(std::slice::from_ref(&store), limits);
+    let options = Options { duration: Duration::from_secs(8), ..options(12) };
+    let report = thread::scope(|threads| {
+        threads.spawn(|| {
+            thread::sleep(Duration::from_secs(2));
+            make(1.0);
+        });
+        load(&served.scene("world"), &options)
+    });
+    assert!(report.errors.is_empty(), "{report:?}");
+    assert_eq!((report.went_over, report.unsettled), (12, 0), "{report:?}");
 }
 
 #[test]

@@ -8,7 +8,7 @@
 //! | `accept`, `still` | the loop that accepts connections, and the end of those that take too long |
 //! | `sendfile` | blobs that the kernel sends by itself |
 //! | `tls` | encryption, with a certificate that changes |
-//! | `limits` | what is allowed |
+//! | `limits`, `open_files` | what is allowed, by us and by the system |
 //! | `front` | what every request meets before the routes, and every answer after them |
 //! | `access` | who may see which scenes, and how often |
 //! | `routes`, `answer`, `many` | what each kind of address is answered with |
@@ -26,6 +26,7 @@ mod front;
 mod limits;
 mod many;
 mod metrics;
+mod open_files;
 mod routes;
 mod scenes;
 mod sendfile;
@@ -39,8 +40,9 @@ pub use tls::TlsError;
 pub use viewer::ViewerError;
 
 use crate::height::Decoded;
-use crate::store::{Disk, Shared, Store, StoreError};
+use crate::store::{Disk, Shared, StoreError};
 use access::{Access, Caller};
+use answer::Told;
 use blobs::Blobs;
 use front::Front;
 use metrics::Metrics;
@@ -134,11 +136,16 @@ struct Site {
 }
 
 impl Site {
-    /// The newest versions of the scenes that somebody may see.
-    fn visible(&self, caller: Caller) -> Vec<Arc<Store>> {
-        let mut stores = self.scenes.all();
-        stores.retain(|store| self.access.allows(caller, &store.scene().name));
-        stores
+    /// The names of the scenes that somebody may see.
+    fn visible(&self, caller: Caller) -> Vec<String> {
+        let mut names = self.scenes.names();
+        names.retain(|name| self.access.allows(caller, name));
+        names
+    }
+
+    /// What these scenes are at their newest versions.
+    fn told(&self, caller: Caller) -> Vec<Arc<Told>> {
+        self.visible(caller).iter().filter_map(|name| self.scenes.told(name)).collect()
     }
 }
 
@@ -173,13 +180,17 @@ impl Server {
         let tls = options.certificate.as_ref().map(|(certificate, key)| Tls::open(certificate, key));
         let tls = tls.transpose()?.map(Arc::new);
         let shared = options.shared()?;
+        // Packs are files, too.
+        let files = open_files::raise();
         let scenes = Scenes::open(stores, &shared)?;
+        let packs = scenes.all().iter().map(|store| store.open_files()).sum();
+        let limits = files.map_or(options.limits, |files| open_files::fit(options.limits, files, packs));
         let viewer = options.web.as_deref().map(Viewer::open).transpose()?;
         let failed = |error| ServeError::Listen { address: listen, error };
         let listener = TcpListener::bind(listen).map_err(failed)?;
         listener.set_nonblocking(true).map_err(failed)?;
         let address = listener.local_addr().map_err(failed)?;
-        Ok(Self { scenes, shared, access, viewer, tls, listener, address, limits: options.limits })
+        Ok(Self { scenes, shared, access, viewer, tls, listener, address, limits })
     }
 
     /// Where the server listens, as a URL.
@@ -197,7 +208,7 @@ impl Server {
     /// The names of its scenes.
     #[must_use]
     pub fn scenes(&self) -> Vec<String> {
-        self.scenes.all().iter().map(|store| store.scene().name.clone()).collect()
+        self.scenes.names()
     }
 
     /// Serves until the process is interrupted or terminated, then lets answers under way end.
@@ -252,7 +263,7 @@ pub fn check(stores: &[PathBuf], options: &Options) -> Result<Vec<String>, Serve
     }
     options.web.as_deref().map(Viewer::open).transpose()?;
     // The disk cache may be in use by the server that these settings are for.
-    Ok(Scenes::open(stores, &Arc::default())?.all().iter().map(|store| store.scene().name.clone()).collect())
+    Ok(Scenes::open(stores, &Arc::default())?.names())
 }
 
 /// Looks for what changes beside the server, as long as it runs: versions of scenes, tokens, certificates.

@@ -15,6 +15,7 @@ pub mod measure;
 pub mod progress;
 pub mod projection;
 pub mod sample;
+mod seldom;
 pub mod settings;
 pub mod size;
 pub mod store;

@@ -136,13 +136,17 @@ fn remedy(report: &Report) -> &'static str {
     if has("429") {
         "429: raise `serve --rate`, or set it to 0"
     } else if has("503") {
-        "503: raise `serve --max-in-flight`"
+        "503: raise `serve --max-in-flight`, of which one address gets half"
     } else if has("open files") {
         "raise the limit on open files (ulimit -n), or use --http2"
     } else if has("closed") || has("reset") {
         "all users come from one address: raise `serve --max-connections-per-address` and --max-connections, or use --http2"
+    } else if has("refused") {
+        "nothing listens there any more: start the server again"
+    } else if has("404") || has("410") {
+        "that server does not serve the scene, or a part of it, any more"
     } else {
-        "the server's log says more"
+        "the server's log says more (RUST_LOG=info tells each request)"
     }
 }
 
@@ -164,7 +168,14 @@ fn print(report: &Report) -> std::io::Result<()> {
     line("requests", &report.requests)?;
     line("diamonds", &report.diamonds)?;
     line("views", &report.views)?;
-    writeln!(out, "  {} views had not settled when the user went on", report.unsettled)?;
+    writeln!(
+        out,
+        "  {} views had not settled when the user went on, {} were still looked at in the end",
+        report.unsettled, report.under_way
+    )?;
+    if report.went_over > 0 {
+        writeln!(out, "  {} times a user went over to another version of the scene", report.went_over)?;
+    }
     let (payloads, bytes) = report.decoded;
     writeln!(out, "  {payloads} different payloads decoded, {:.2} MB", bytes as f64 / 1e6)?;
     for (kind, count) in &report.errors {

@@ -4,23 +4,26 @@
 //! place after another with time to think between. What it asks for follows from its cut; what it is sent is checked:
 //! checksums, the index's sizes, and by decoding (`ledger`). Nothing is drawn.
 //!
+//! Where another version of the scene takes over, users who are told so (410) load its description and go on there.
+//!
 //! A request's latency is from when it is sent to its answer's last byte, a diamond's to its own last byte. A view has settled when
 //! all is there that its cut wants.
 
 mod ledger;
 mod tally;
 mod user;
+mod versions;
 
 use crate::encoding::Encoding;
-use crate::fetch::{FetchError, check_layers, connect, describe, parse_address};
+use crate::fetch::{FetchError, connect, parse_address};
 use crate::headless::FlightPath;
-use ledger::Ledger;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use tally::Tally;
 pub use tally::{Latencies, Report};
 use user::User;
+use versions::{Source, Versions};
 
 /// How to load a server.
 #[derive(Debug, Clone)]
@@ -86,46 +89,29 @@ pub fn run(url: &str, options: &Options, mut tell: impl FnMut(&Report)) -> Resul
         builder.build().map_err(|e| FetchError::Start(e.to_string()))
     };
     let root = base.as_str().trim_end_matches('/').to_owned();
-    let mut scene = runtime.block_on(describe(client(0)?, &root, name.as_deref()))?;
-    if let Some(names) = &options.layers {
-        check_layers(&scene, names)?;
-        let chosen: Vec<bool> = scene
-            .layers
-            .iter()
-            .map(|layer| names.iter().any(|n| n == scene.chosen_as(&layer.name)))
-            .collect();
-        let mut chosen = chosen.into_iter();
-        scene.layers.retain(|_| chosen.next().unwrap_or(false));
-    }
-    // Users look at the first step of a series.
-    for series in std::mem::take(&mut scene.series) {
-        scene.layers.retain(|layer| !series.layers[1..].contains(&layer.name));
-    }
-    for layer in &mut scene.layers {
-        let (name, asked) = (layer.name.clone(), options.encoding.name());
-        *layer = options.encoding.layer(layer).ok_or(LoadError::Encoding(name, asked))?;
-    }
-    let scene = Arc::new(scene);
-    let ledger = Arc::new(Ledger::new((*scene).clone(), options.encoding));
+    let source = Source { client: client(0)?, root, name };
+    let versions = Arc::new(runtime.block_on(Versions::open(source, options))?);
+    let first = runtime.block_on(versions.newest());
     let tally = Arc::new(Tally::default());
     let stopping = Arc::new(AtomicBool::new(false));
     let began = Instant::now();
     let mut users = Vec::new();
     for number in 0..options.users {
-        let user = User::new(number, &root, client(number)?, &scene, options);
-        let (ledger, tally, stopping) = (Arc::clone(&ledger), Arc::clone(&tally), Arc::clone(&stopping));
+        let user = User::new(number, &versions, client(number)?, Arc::clone(&first), options);
+        let (tally, stopping) = (Arc::clone(&tally), Arc::clone(&stopping));
         let after = options.arrival.mul_f64(f64::from(number) / f64::from(options.users));
         users.push(runtime.spawn(async move {
             tokio::time::sleep(after).await;
-            user.run(&ledger, &tally, &stopping).await;
+            user.run(&tally, &stopping).await;
         }));
     }
+    let report = || tally.report(options.users, began.elapsed(), runtime.block_on(versions.size()));
     while began.elapsed() < options.duration {
         std::thread::sleep(Duration::from_secs(1).min(options.duration.saturating_sub(began.elapsed())));
-        tell(&tally.report(options.users, began.elapsed(), ledger.size()));
+        tell(&report());
     }
     stopping.store(true, Ordering::Relaxed);
-    let report = tally.report(options.users, began.elapsed(), ledger.size());
+    let report = report();
     users.iter().for_each(tokio::task::JoinHandle::abort);
     runtime.shutdown_background();
     Ok(report)

@@ -49,6 +49,10 @@ pub struct Report {
     pub views: Latencies,
     /// Views that had not settled when the user went on.
     pub unsettled: u64,
+    /// Views that were still looked at.
+    pub under_way: u64,
+    /// Times that a user went over to another version of the scene.
+    pub went_over: u64,
     /// Bytes of answers, without their headers.
     pub bytes: u64,
     /// The same, for each user.
@@ -68,7 +72,9 @@ struct Counts {
     requests: Vec<f32>,
     diamonds: Vec<f32>,
     views: Vec<f32>,
+    begun: u64,
     unsettled: u64,
+    went_over: u64,
     bytes: u64,
     errors: BTreeMap<String, u64>,
 }
@@ -93,6 +99,16 @@ impl Tally {
             counts.diamonds.extend(diamonds.iter().map(|time| milliseconds(*time)));
             counts.bytes += bytes as u64;
         });
+    }
+
+    /// A user looks at another view.
+    pub(super) fn looks(&self) {
+        self.with(|counts| counts.begun += 1);
+    }
+
+    /// A user went over to another version.
+    pub(super) fn went_over(&self) {
+        self.with(|counts| counts.went_over += 1);
     }
 
     /// A view has settled after some time, or not at all.
@@ -130,6 +146,8 @@ impl Tally {
             diamonds: Latencies::of(&counts.diamonds),
             views: Latencies::of(&counts.views),
             unsettled: counts.unsettled,
+            under_way: counts.begun - counts.unsettled - counts.views.len() as u64,
+            went_over: counts.went_over,
             bytes: counts.bytes,
             bytes_a_user: counts.bytes as f64 / f64::from(users.max(1)),
             requests_a_second: counts.requests.len() as f64 / seconds.max(1e-9),

@@ -1,13 +1,14 @@
 //! One user: looks at one view after another, and asks for what its cut lacks.
 
 use super::Options;
-use super::ledger::{Ledger, WrongError};
+use super::ledger::WrongError;
 use super::tally::Tally;
+use super::versions::{Version, Versions};
 use crate::cache::{Cache, Index, PAGES_MAX};
 use crate::camera::Camera;
 use crate::cut::{self, Ask};
 use crate::encoding::Encoding;
-use crate::fetch::{Answer, Ask as Request, one};
+use crate::fetch::{Answer, Ask as Request, FetchError, one};
 use crate::headless::{Dice, FlightPath, PathKey};
 use crate::overview::extent;
 use crate::sight::Sight;
@@ -59,13 +60,16 @@ struct Layer {
 
 /// One user, who has not arrived yet.
 pub(super) struct User {
-    base: String,
+    versions: Arc<Versions>,
     client: Client,
-    scene: Arc<Scene>,
+    version: Arc<Version>,
     encoding: Encoding,
     layers: Vec<Layer>,
     cache: Cache,
+    memory_bytes: usize,
     path: FlightPath,
+    /// Whether the path is the user's own, made for the scene.
+    wanders: bool,
     views: u32,
     first: u32,
     think: Duration,
@@ -75,30 +79,40 @@ pub(super) struct User {
     dice: Dice,
 }
 
+/// What a user has of a version, at first: nothing.
+fn nothing(scene: &Scene, memory_bytes: usize) -> (Vec<Layer>, Cache) {
+    let share = memory_bytes / scene.layers.len() / 4 * 3;
+    let layer = |forest| Layer { index: Index::new(forest), memory_bytes: share };
+    let layers = scene.layers.iter().map(|of| layer(of.forest)).collect();
+    (layers, Cache::new(scene.layers.iter().map(|of| of.forest).collect(), memory_bytes))
+}
+
 impl User {
     pub(super) fn new(
         number: u32,
-        base: &str,
+        versions: &Arc<Versions>,
         client: Client,
-        scene: &Arc<Scene>,
+        version: Arc<Version>,
         options: &Options,
     ) -> Self {
         let mut dice = Dice(options.seed ^ u64::from(number).wrapping_mul(0x9E37_79B9_7F4A_7C15));
-        let (path, views, first) = match options.paths.get(number as usize % options.paths.len().max(1)) {
+        let given = options.paths.get(number as usize % options.paths.len().max(1));
+        let (path, views, first) = match given {
             // Not all at the same place at once.
             Some(path) => (path.clone(), options.views, number.wrapping_mul(7919) % options.views.max(1)),
-            None => (wandering(scene, &mut dice), PLACES, 0),
+            None => (wandering(&version.scene, &mut dice), PLACES, 0),
         };
-        let share = options.memory_bytes / scene.layers.len() / 4 * 3;
-        let layer = |forest| Layer { index: Index::new(forest), memory_bytes: share };
+        let (layers, cache) = nothing(&version.scene, options.memory_bytes);
         Self {
-            base: base.to_owned(),
+            versions: Arc::clone(versions),
             client,
-            scene: Arc::clone(scene),
+            version,
             encoding: options.encoding,
-            layers: scene.layers.iter().map(|of| layer(of.forest)).collect(),
-            cache: Cache::new(scene.layers.iter().map(|of| of.forest).collect(), options.memory_bytes),
+            layers,
+            cache,
+            memory_bytes: options.memory_bytes,
             path,
+            wanders: given.is_none(),
             views,
             first,
             think: options.think,
@@ -110,14 +124,14 @@ impl User {
     }
 
     /// Looks at views until there is enough.
-    pub(super) async fn run(mut self, ledger: &Ledger, tally: &Tally, stopping: &AtomicBool) {
+    pub(super) async fn run(mut self, tally: &Tally, stopping: &AtomicBool) {
         for view in self.first.. {
             if stopping.load(Ordering::Relaxed) {
                 return;
             }
+            tally.looks();
             let part = f64::from(view % self.views) / f64::from((self.views - 1).max(1));
-            let camera = self.path.camera(part, self.size);
-            let settled = self.settle(&camera, ledger, tally, stopping).await;
+            let settled = self.settle(part, tally, stopping).await;
             if !stopping.load(Ordering::Relaxed) {
                 tally.viewed(settled);
             }
@@ -125,28 +139,25 @@ impl User {
         }
     }
 
-    /// Asks for what a view lacks until nothing is missing; how long that took, or `None` if it did not come to an end.
-    async fn settle(
-        &mut self,
-        camera: &Camera,
-        ledger: &Ledger,
-        tally: &Tally,
-        stopping: &AtomicBool,
-    ) -> Option<Duration> {
+    /// Asks for what a view lacks until nothing is missing; how long that took, or `None` if it did not come to an end. The view is
+    /// that at a part of the path.
+    async fn settle(&mut self, part: f64, tally: &Tally, stopping: &AtomicBool) -> Option<Duration> {
         let began = Instant::now();
         while began.elapsed() < VIEW_PATIENCE && !stopping.load(Ordering::Relaxed) {
-            let (requests, empty) = self.missing(camera);
+            let camera = self.path.camera(part, self.size);
+            let (requests, empty) = self.missing(&camera);
             let is_settled = requests.is_empty() && empty.is_empty();
             if is_settled {
                 return Some(began.elapsed());
             }
             let mut arrived: Vec<(usize, Diamond, Bytes)> =
                 empty.into_iter().map(|(layer, d)| (layer, d, Bytes::new())).collect();
-            let (client, base, scene, encoding) = (&self.client, &self.base, &self.scene, self.encoding);
+            let base = &*self.versions.source.root;
+            let (client, scene, encoding) = (&self.client, &self.version.scene, self.encoding);
             let mut answers = futures_util::stream::iter(requests)
                 .map(|request| async move { one(client, base, scene, encoding, &request).await })
                 .buffer_unordered(self.requests_max);
-            let mut has_failed = false;
+            let [mut has_failed, mut is_gone] = [false; 2];
             let mut pages = Vec::new();
             while let Some(answer) = answers.next().await {
                 match answer {
@@ -155,6 +166,7 @@ impl User {
                         pages.extend(page);
                         arrived.extend(payloads);
                     }
+                    Err(FetchError::Status { status: 410, .. }) => is_gone = true,
                     Err(error) => {
                         tally.refused(&error);
                         has_failed = true;
@@ -165,7 +177,10 @@ impl User {
             for (layer, number, entries) in pages {
                 self.layers[layer].index.insert(number, entries);
             }
-            self.take(arrived, ledger, tally);
+            self.take(arrived, tally);
+            if is_gone {
+                has_failed |= !self.go_over(tally).await;
+            }
             if has_failed {
                 tokio::time::sleep(PAUSE.mul_f64(1.0 + self.dice.roll())).await;
             }
@@ -173,12 +188,32 @@ impl User {
         None
     }
 
+    /// Goes over to the version that took the place of this one; whether there is one.
+    async fn go_over(&mut self, tally: &Tally) -> bool {
+        match self.versions.after(&self.version).await {
+            Ok(Some(newer)) => {
+                (self.layers, self.cache) = nothing(&newer.scene, self.memory_bytes);
+                if self.wanders {
+                    self.path = wandering(&newer.scene, &mut self.dice);
+                }
+                self.version = newer;
+                tally.went_over();
+                return true;
+            }
+            Ok(None) => {
+                tally.failed("status 410, of a version that the server still describes as its newest")
+            }
+            Err(error) => tally.refused(&error),
+        }
+        false
+    }
+
     /// What the cut of a view lacks: requests, most urgent first, and diamonds without a payload.
     fn missing(&mut self, camera: &Camera) -> (Vec<Request>, Vec<(usize, Diamond)>) {
         let (mut pages, mut wishes, mut wanted) = (Vec::new(), Vec::new(), Vec::new());
         for (number, state) in self.layers.iter_mut().enumerate() {
             let ask = Ask {
-                layer: &self.scene.layers[number],
+                layer: &self.version.scene.layers[number],
                 encoding: self.encoding,
                 camera,
                 exaggeration: 1.0,
@@ -200,18 +235,23 @@ impl User {
         let (empty, full): (Vec<_>, Vec<_>) = wishes.into_iter().partition(|(_, wish)| wish.bytes == Some(0));
         let wants = full.into_iter().map(|(layer, wish)| (layer, wish.diamond, wish.bytes));
         let mut requests = pages;
-        requests.extend(Request::batches(&self.base, &self.scene, self.encoding, wants));
+        requests.extend(Request::batches(
+            &self.versions.source.root,
+            &self.version.scene,
+            self.encoding,
+            wants,
+        ));
         // What is not asked for now is asked for by the next cut, which knows more.
         requests.truncate(self.requests_max);
         (requests, empty.into_iter().map(|(layer, wish)| (layer, wish.diamond)).collect())
     }
 
     /// Takes payloads in, parents before children.
-    fn take(&mut self, mut arrived: Vec<(usize, Diamond, Bytes)>, ledger: &Ledger, tally: &Tally) {
+    fn take(&mut self, mut arrived: Vec<(usize, Diamond, Bytes)>, tally: &Tally) {
         arrived.sort_by_key(|(layer, d, _)| (d.level(), *layer));
         for (layer, d, payload) in arrived {
             let held = |d: Diamond| self.cache.get((layer, d)).cloned();
-            match ledger.surface((layer, d), &payload, held) {
+            match self.version.ledger.surface((layer, d), &payload, held) {
                 Ok(surface) => {
                     self.cache.insert((layer, d), surface, true);
                 }

@@ -10,6 +10,7 @@ use super::metrics::Metrics;
 use super::sendfile::{Outbox, Sender};
 use super::still::{Activity, Noted, Patience, Watched};
 use super::tls::Tls;
+use crate::seldom::Seldom;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto;
@@ -61,6 +62,7 @@ pub(super) async fn serve(
         patience: Patience::from(&limits),
         tls,
         handshake: limits.head,
+        refused: Seldom::default(),
     };
     door.accept(&listener, stop).await;
     front.stop();
@@ -100,6 +102,8 @@ struct Door {
     tls: Option<Arc<Tls>>,
     /// How long it may take until a connection is encrypted.
     handshake: Duration,
+    /// By the system.
+    refused: Seldom,
 }
 
 impl Door {
@@ -112,7 +116,10 @@ impl Door {
             match accepted {
                 Ok((stream, from)) => self.admit(stream, from),
                 Err(error) => {
-                    tracing::warn!(%error, "accept");
+                    self.front.metrics().rejected("accept");
+                    if let Some(times) = self.refused.happened() {
+                        tracing::warn!(%error, times, "the system refuses to accept connections");
+                    }
                     tokio::time::sleep(ACCEPT_PAUSE).await;
                 }
             }

@@ -1,14 +1,19 @@
 //! What answers are made of: refusals in words, tags, and who has something already.
 
 use crate::store::StoreError;
-use axum::body::Body;
+use axum::body::{Body, Bytes};
 use axum::extract::{self, FromRequestParts};
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use diamantina_protocol::message::Problem;
+use http_body::{Frame, SizeHint};
 use serde::de::DeserializeOwned;
+use std::collections::VecDeque;
+use std::convert::Infallible;
+use std::pin::Pin;
 use std::sync::Arc;
+use std::task::{Context, Poll};
 
 /// For what never changes.
 pub(super) const IMMUTABLE: &str = "public, max-age=31536000, immutable";
@@ -141,9 +146,88 @@ fn names(headers: &HeaderMap, header: &HeaderName, tag: &str) -> bool {
     })
 }
 
-/// JSON that is asked for again each time, by its ETag.
-pub(super) fn json(headers: &HeaderMap, value: &impl serde::Serialize) -> Response {
-    let body = serde_json::to_vec(value).unwrap_or_default();
-    let hash = blake3::hash(&body).to_hex();
-    tagged(headers, &hash[..16], "no-cache", "application/json", || body.into())
+/// JSON that is made once, is shared by all answers that it is in, and is asked for again each time, by its ETag.
+#[derive(Debug, Clone)]
+pub(super) struct Told {
+    pieces: Vec<Bytes>,
+    tag: String,
+}
+
+impl Told {
+    pub(super) fn of(value: &impl serde::Serialize) -> Self {
+        let text = serde_json::to_vec(value).unwrap_or_default();
+        let tag = tag_of(&text);
+        Self { pieces: vec![text.into()], tag }
+    }
+
+    /// All scenes, of what is told of each: a [`Catalogue`](diamantina_protocol::message::Catalogue).
+    pub(super) fn catalogue(scenes: &[Arc<Self>]) -> Self {
+        let mut pieces = vec![Bytes::from_static(b"{\"scenes\":[")];
+        for (number, scene) in scenes.iter().enumerate() {
+            if number > 0 {
+                pieces.push(Bytes::from_static(b","));
+            }
+            pieces.extend_from_slice(&scene.pieces);
+        }
+        pieces.push(Bytes::from_static(b"]}"));
+        let tags: Vec<&str> = scenes.iter().map(|scene| &*scene.tag).collect();
+        Self { pieces, tag: tag_of(tags.join(" ").as_bytes()) }
+    }
+
+    /// The answer to who asks with these headers.
+    pub(super) fn answer(&self, headers: &HeaderMap) -> Response {
+        let body = || Body::new(Pieces(self.pieces.clone().into()));
+        tagged(headers, &self.tag, "no-cache", "application/json", body)
+    }
+}
+
+fn tag_of(bytes: &[u8]) -> String {
+    blake3::hash(bytes).to_hex()[..16].to_owned()
+}
+
+/// A body of several pieces, none of which is copied.
+struct Pieces(VecDeque<Bytes>);
+
+impl http_body::Body for Pieces {
+    type Data = Bytes;
+    type Error = Infallible;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        _: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, Infallible>>> {
+        Poll::Ready(self.0.pop_front().map(|piece| Ok(Frame::data(piece))))
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        SizeHint::with_exact(self.0.iter().map(|piece| piece.len() as u64).sum())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use axum::body::to_bytes;
+    use diamantina_protocol::message::{Catalogue, Frame, Scene};
+
+    fn scene(name: &str) -> Scene {
+        let frame = Frame { crs: None, vertical_unit: "metre".to_owned() };
+        let (name, version) = (name.to_owned(), "0123456789abcdef".to_owned());
+        Scene { name, version, frame, layers: vec![], zones: vec![], textures: vec![], series: vec![] }
+    }
+
+    #[tokio::test]
+    async fn a_catalogue_of_what_is_told_of_scenes_is_that_of_the_scenes() {
+        for names in [&[][..], &["a"], &["a", "b", "c"]] {
+            let scenes: Vec<Scene> = names.iter().map(|name| scene(name)).collect();
+            let told: Vec<_> = scenes.iter().map(|scene| Arc::new(Told::of(scene))).collect();
+            let answer = Told::catalogue(&told).answer(&HeaderMap::new());
+            let body = to_bytes(answer.into_body(), 1 << 20).await.unwrap();
+            assert_eq!(body, serde_json::to_vec(&Catalogue { scenes }).unwrap(), "{names:?}");
+        }
+    }
 }

@@ -49,6 +49,7 @@ pub(super) struct Front {
     routes: TowerToHyperService<Router>,
     site: Arc<Site>,
     places: Arc<Semaphore>,
+    most_of_address: usize,
     rates: Option<Rates>,
     ids: RequestIds,
     stopping: AtomicBool,
@@ -71,6 +72,7 @@ impl Front {
             routes: TowerToHyperService::new(routes::router(Arc::clone(&site))),
             site,
             places: Arc::new(Semaphore::new(limits.max_in_flight as usize)),
+            most_of_address: limits.max_connections_per_address as usize,
             rates: rates.map(|(rate, burst)| Rates::new(rate, burst)),
             ids: RequestIds::new(),
             stopping: AtomicBool::new(false),
@@ -145,8 +147,8 @@ impl Front {
     }
 
     /// Places for the answer to a request, of its address's and of all, if it is one that this server answers and there is
-    /// room. Who asks how the server is
-    /// has to be told, above all when there is much to do: that takes no place, and counts for no rate.
+    /// room. Who asks how the server is has to be told, above all when there is much to do: that takes no place, and counts for
+    /// no rate.
     fn admit(
         &self,
         connection: &Connection,
@@ -190,15 +192,30 @@ impl Front {
                 return Err(Box::new(later(StatusCode::TOO_MANY_REQUESTS, detail, 1 + wait.as_secs())));
             }
         }
-        let place = |places: &Arc<Semaphore>, reason| {
-            Arc::clone(places).try_acquire_owned().map_err(|_| {
-                self.site.metrics.rejected(reason);
-                let detail = "too much to do: ask again in a moment";
-                Box::new(later(StatusCode::SERVICE_UNAVAILABLE, detail, RETRY_AFTER))
-            })
-        };
-        let of_address = place(&connection.answers, "in_flight_of_address")?;
-        Ok(Some([of_address, place(&self.places, "in_flight")?]))
+        self.places(connection).map(Some).map_err(|reason| {
+            self.site.metrics.rejected(reason);
+            let detail = "too much to do: ask again in a moment";
+            Box::new(later(StatusCode::SERVICE_UNAVAILABLE, detail, RETRY_AFTER))
+        })
+    }
+
+    /// Places for an answer, or which limit leaves none.
+    ///
+    /// An address has no more of them than are free: one alone gets half of all, and however many of them ask for as much as they
+    /// can, there is as much room left as each has, for whoever comes next (Choudhury and Hahne's dynamic thresholds for
+    /// switches with a shared memory, 1998, with alpha = 1).
+    fn places(&self, connection: &Connection) -> Result<[OwnedSemaphorePermit; 2], &'static str> {
+        let taken = self.most_of_address.saturating_sub(connection.answers.available_permits());
+        let free = self.places.available_permits();
+        if free == 0 {
+            return Err("in_flight");
+        }
+        if taken >= free {
+            return Err("in_flight_of_address");
+        }
+        let take =
+            |places: &Arc<Semaphore>, reason| Arc::clone(places).try_acquire_owned().map_err(|_| reason);
+        Ok([take(&connection.answers, "in_flight_of_address")?, take(&self.places, "in_flight")?])
     }
 }
 

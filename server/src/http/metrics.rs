@@ -197,6 +197,10 @@ impl prometheus_client::collector::Collector for Objects {
             counter.encode(encoder.encode_descriptor(name, help, None, counter.metric_type())?)?;
         }
         if let Some(disk) = &self.0.disk {
+            let counter = ConstCounter::new(disk.failed());
+            let help = "Pieces that the disk cache could not write";
+            let kind = counter.metric_type();
+            counter.encode(encoder.encode_descriptor("disk_cache_failures", help, None, kind)?)?;
             let gauge = ConstGauge::new(disk.bytes()[0]);
             gauge.encode(encoder.encode_descriptor(
                 "disk_cache_bytes",

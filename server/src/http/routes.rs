@@ -2,7 +2,7 @@
 
 use super::Site;
 use super::access::Caller;
-use super::answer::{IMMUTABLE, IMMUTABLE_PRIVATE, OCTETS, Path, Refusal, json, no_address, tagged};
+use super::answer::{IMMUTABLE, IMMUTABLE_PRIVATE, OCTETS, Path, Refusal, Told, no_address, tagged};
 use super::blobs::Blob;
 use super::contract::{self, About, Form, Holds};
 use super::many::{self, Batch};
@@ -21,7 +21,7 @@ use axum::response::{Html, IntoResponse, Response};
 use axum::routing::{MethodRouter, get};
 use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::index;
-use diamantina_protocol::message::{self, BATCH_MAX, Catalogue, Layer, STREAM_MAX, Scene};
+use diamantina_protocol::message::{self, BATCH_MAX, Layer, STREAM_MAX};
 use diamantina_protocol::texture::Tile;
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -128,8 +128,8 @@ pub(super) fn router(site: Arc<Site>) -> Router {
     let mut lines = lines();
     let ours = ("/openapi.json", about("This document", Holds::Json));
     let told = lines.iter().map(|(template, about, _)| (*template, about)).chain([(ours.0, &ours.1)]);
-    let document = Arc::new(contract::document(told));
-    let tell = get(move |headers: HeaderMap| async move { json(&headers, &*document) });
+    let document = Arc::new(Told::of(&contract::document(told)));
+    let tell = get(move |headers: HeaderMap| async move { document.answer(&headers) });
     lines.push((ours.0, ours.1, tell));
     let mut router = Router::new();
     for (template, _, methods) in lines {
@@ -173,8 +173,7 @@ async fn front_page(State(site): State<Arc<Site>>, caller: Caller, headers: Head
          <h1>Diamantina</h1><p>This server streams terrain. The viewer for browsers is not built here: <code>make web</code> builds \
          it, and says what it needs; then start the server again. Or open a scene with the client:</p><ul>",
     );
-    for store in site.visible(caller) {
-        let name = &store.scene().name;
+    for name in site.visible(caller) {
         // Names are letters, digits, '-', '_' and '.': nothing to escape.
         page += &format!(
             "<li><a href=/scenes/{name}>{name}</a> <code>diamantina-client view http://THIS-SERVER/scenes/{name}</code>"
@@ -196,8 +195,7 @@ async fn viewer_file(
 }
 
 async fn catalogue(State(site): State<Arc<Site>>, caller: Caller, headers: HeaderMap) -> Response {
-    let scenes: Vec<Scene> = site.visible(caller).iter().map(|s| s.scene().clone()).collect();
-    json(&headers, &Catalogue { scenes })
+    Told::catalogue(&site.told(caller)).answer(&headers)
 }
 
 /// The newest version of a scene.
@@ -241,7 +239,8 @@ async fn scene(
     Path(name): Path<String>,
     headers: HeaderMap,
 ) -> Result<Response, Refusal> {
-    Ok(json(&headers, find_scene(&site, caller, &name)?.scene()))
+    let told = site.scenes.told(&name).filter(|_| site.access.allows(caller, &name));
+    Ok(told.ok_or_else(no_scene)?.answer(&headers))
 }
 
 /// A number of an address as it is written here, so that what it names has one address.

@@ -5,6 +5,7 @@
 //! version before goes on with it: its files stay open even where the build has removed them.
 
 use super::ServeError;
+use super::answer::Told;
 use super::metrics::Metrics;
 use crate::store::{Shared, Store, StoreError};
 use std::collections::BTreeMap;
@@ -22,6 +23,8 @@ pub(super) struct Scenes(RwLock<BTreeMap<String, Shown>>);
 #[derive(Debug)]
 struct Shown {
     now: Arc<Store>,
+    /// What `now` is, as it is told: up to a megabyte for a series of hundreds of steps.
+    told: Arc<Told>,
     /// Versions before, and until when they are served.
     before: Vec<(Arc<Store>, Instant)>,
     /// A version that is not sound, and since when that is known.
@@ -46,7 +49,8 @@ impl Scenes {
                 let (first, second) = (first.now.root().to_owned(), path.clone());
                 return Err(ServeError::SameName { name, first, second });
             }
-            scenes.insert(name, Shown { now: Arc::new(store), before: Vec::new(), refused: None });
+            let told = Arc::new(Told::of(store.scene()));
+            scenes.insert(name, Shown { now: Arc::new(store), told, before: Vec::new(), refused: None });
         }
         Ok(Self(RwLock::new(scenes)))
     }
@@ -69,6 +73,16 @@ impl Scenes {
     /// The newest version of a scene.
     pub(super) fn newest(&self, name: &str) -> Option<Arc<Store>> {
         self.read(|scenes| scenes.get(name).map(|shown| Arc::clone(&shown.now)))
+    }
+
+    /// The names of all scenes, in order.
+    pub(super) fn names(&self) -> Vec<String> {
+        self.read(|scenes| scenes.keys().cloned().collect())
+    }
+
+    /// What a scene is at its newest version.
+    pub(super) fn told(&self, name: &str) -> Option<Arc<Told>> {
+        self.read(|scenes| scenes.get(name).map(|shown| Arc::clone(&shown.told)))
     }
 
     /// A scene at a version.
@@ -117,7 +131,9 @@ impl Scenes {
                         "another version is served"
                     );
                     metrics.swaps.inc();
+                    let told = Arc::new(Told::of(newer.scene()));
                     self.change(name, |shown| {
+                        shown.told = told;
                         let before = std::mem::replace(&mut shown.now, Arc::new(newer));
                         shown.before.push((before, Instant::now() + grace));
                         shown.refused = None;

@@ -11,6 +11,7 @@
 //! synced, and a kill or a loss of power costs what was being written.
 
 use super::{StoreError, io_at};
+use crate::seldom::Seldom;
 use bytes::Bytes;
 use quick_cache::sync::Cache;
 use quick_cache::{DefaultHashBuilder, Lifecycle, OptionsBuilder, Weighter};
@@ -77,6 +78,8 @@ pub struct Disk {
     budget: u64,
     cache: Cache<Piece, u32, ByBlocks, DefaultHashBuilder, Remove>,
     written: AtomicU64,
+    failed: AtomicU64,
+    seldom: Seldom,
     _lock: File,
 }
 
@@ -90,7 +93,8 @@ impl Disk {
         if budget < BUDGET_MIN {
             return Err(refused(format!("--disk-cache-size {budget}: expected at least {BUDGET_MIN} bytes")));
         }
-        fs::create_dir_all(root).map_err(io_at("create the folder", root))?;
+        fs::create_dir_all(root)
+            .map_err(|e| refused(format!("the folder cannot be made ({e}): choose another one")))?;
         let mut kept = Vec::new();
         for entry in fs::read_dir(root).map_err(io_at("list", root))? {
             let entry = entry.map_err(io_at("list", root))?;
@@ -128,7 +132,9 @@ impl Disk {
             // Only if nothing is in it.
             let _ = fs::remove_dir(&folder);
         }
-        Ok(Self { root: root.to_owned(), budget, cache, written: AtomicU64::new(0), _lock: lock })
+        let root = root.to_owned();
+        let [written, failed] = [0, 0].map(AtomicU64::new);
+        Ok(Self { root, budget, cache, written, failed, seldom: Seldom::default(), _lock: lock })
     }
 
     /// The piece, if it is kept with that many bytes. Waits for the disk.
@@ -143,7 +149,7 @@ impl Disk {
         }
     }
 
-    /// Keeps a piece. That the disk fails is told in the log, and nothing else comes of it.
+    /// Keeps a piece. That the disk fails is counted and told in the log, and nothing else comes of it.
     pub(super) fn put(&self, piece: Piece, bytes: &[u8]) {
         let path = path(&self.root, piece);
         let number = self.written.fetch_add(1, Ordering::Relaxed);
@@ -159,7 +165,10 @@ impl Disk {
             Ok(()) => self.cache.insert(piece, u32::try_from(bytes.len()).unwrap_or(u32::MAX)),
             Err(error) => {
                 let _ = fs::remove_file(&fresh);
-                tracing::warn!(path = %path.display(), %error, "the disk cache cannot be written");
+                self.failed.fetch_add(1, Ordering::Relaxed);
+                if let Some(times) = self.seldom.happened() {
+                    tracing::warn!(path = %path.display(), %error, times, "the disk cache cannot be written");
+                }
             }
         }
     }
@@ -168,6 +177,12 @@ impl Disk {
     pub(super) fn forget(&self, piece: Piece) {
         self.cache.remove(&piece);
         let _ = fs::remove_file(path(&self.root, piece));
+    }
+
+    /// Pieces that could not be written.
+    #[must_use]
+    pub fn failed(&self) -> u64 {
+        self.failed.load(Ordering::Relaxed)
     }
 
     /// Bytes that are kept, in whole blocks, and the most that may be.
@@ -217,11 +232,27 @@ mod tests {
     }
 
     #[test]
+    fn what_cannot_be_written_is_counted_and_not_kept() {
+        let folder = tempfile::tempdir().unwrap();
+        let disk = Disk::open(folder.path(), 16 << 20).unwrap();
+        // No folder can be made where a file is.
+        fs::write(folder.path().join(format!("{:016x}", 1)), "x").unwrap();
+        for number in 0..3 {
+            disk.put((1, 0, number), b"piece");
+        }
+        disk.put((2, 0, 0), b"piece");
+        assert_eq!(disk.failed(), 3);
+        assert!(disk.get((1, 0, 0), 5).is_none() && disk.get((2, 0, 0), 5).is_some());
+    }
+
+    #[test]
     fn a_folder_with_something_else_in_it_is_left_alone() {
         let folder = tempfile::tempdir().unwrap();
         fs::write(folder.path().join("thesis.tex"), "x").unwrap();
         let told = Disk::open(folder.path(), 1 << 30).unwrap_err().to_string();
         assert!(told.contains("thesis.tex"), "{told}");
+        let told = Disk::open(&folder.path().join("thesis.tex/x"), 1 << 30).unwrap_err().to_string();
+        assert!(told.contains("no disk cache") && told.contains("choose another"), "{told}");
         assert!(Disk::open(&folder.path().join("x"), 1000).unwrap_err().to_string().contains("16777216"));
     }
 }

@@ -163,6 +163,15 @@ impl Store {
         matches!(self.source, Source::Remote(_))
     }
 
+    /// Files that are open as long as the store is.
+    #[must_use]
+    pub fn open_files(&self) -> u64 {
+        match &self.source {
+            Source::Packs(packs) => packs.len() as u64,
+            Source::Remote(_) => 0,
+        }
+    }
+
     /// How long the object store has not been reached, if it is one and that is so.
     #[must_use]
     pub fn away(&self) -> Option<std::time::Duration> {
