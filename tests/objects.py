@@ -514,7 +514,7 @@ class Trial:
             front.get("/scenes/noise")
             described = front.get("/scenes/noise")[1]
             check(described.get("X-Cache-Status") is None, f"nginx keeps what changes: {described}")
-            status = front.get("/scenes/noise", headers={"If-None-Match": described["ETag"]})[0]
+            status = front.get("/scenes/noise", headers={"If-None-Match": described["etag"]})[0]
             check(status == 304, f"through nginx who has a description gets {status} instead of 304")
             servers[1].stop(signal.SIGKILL)
             check(all(front.get(path)[2] == expected[path][2] for path in paths[:100]), "the cache is no use without servers")
