@@ -11,6 +11,7 @@ use super::sendfile::{Outbox, Sender};
 use super::still::{Activity, Noted, Patience, Watched};
 use super::tls::Tls;
 use crate::seldom::Seldom;
+use http_body::Body as _;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto;
@@ -30,14 +31,21 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
 /// The pause after the system refused to accept, for want of files or memory.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 
-/// Requests that a thread takes in one turn where there is more to do than a machine can: from then on it lets others have the
-/// core once all are answered. Else answers pile up that nobody gets to read, and the latest are late by whole turns of the
-/// scheduler. Where there is less to do it is this thread that would be late.
-const MANY: u32 = 6;
+/// What a thread does in one turn where there is more to do than a machine can, in requests of small answers: from then on it
+/// lets others have the core once all are answered. Else answers pile up that nobody gets to read, and the latest are late by
+/// whole turns of the scheduler. Where there is less to do it is this thread that would be late.
+const MANY: u64 = 6;
+
+/// Bytes of an answer that are as much to do for whoever reads it as another request.
+const AS_MUCH: u64 = 32 << 10;
 
 thread_local! {
-    /// Requests that this thread has taken since it last had nothing to do.
-    static TAKEN: Cell<u32> = const { Cell::new(0) };
+    /// What this thread has done since it last had nothing to do.
+    static DONE: Cell<u64> = const { Cell::new(0) };
+}
+
+fn done(more: u64) {
+    DONE.set(DONE.get().saturating_add(more));
 }
 
 /// Serves what is behind `front` on connections of `listener` until `stop` is done and the answers under way have ended,
@@ -182,7 +190,7 @@ impl Crew {
             let mut builder = tokio::runtime::Builder::new_current_thread();
             builder.enable_all();
             builder.on_thread_park(|| {
-                if TAKEN.replace(0) >= MANY {
+                if DONE.replace(0) >= MANY {
                     std::thread::yield_now();
                 }
             });
@@ -224,8 +232,11 @@ impl Visit {
         let io = TokioIo::new(Box::pin(Watched::new(stream, Arc::clone(&connection.activity), patience)));
         let service = service_fn(move |request| {
             let (front, connection) = (Arc::clone(&front), Arc::clone(&connection));
-            TAKEN.set(TAKEN.get().saturating_add(1));
-            async move { Ok::<_, Infallible>(front.answer(&connection, request).await) }
+            async move {
+                let answer = front.answer(&connection, request).await;
+                done(1 + answer.body().size_hint().lower() / AS_MUCH);
+                Ok::<_, Infallible>(answer)
+            }
         });
         let served = builder.serve_connection(io, service).into_owned();
         if let Err(error) = watcher.watch(served).await {
