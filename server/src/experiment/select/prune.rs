@@ -281,3 +281,51 @@ impl Areas {
 fn zeros([x, y]: Point) -> usize {
     (x | y).trailing_zeros() as usize
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const LOG2: u8 = 4;
+    const SIDE: u32 = 1 << LOG2;
+
+    /// The unit cells of the grid that the square around a point covers: the first, and the one after the last.
+    fn covered(point: Point) -> [[u32; 2]; 2] {
+        let reach = 1 << zeros(point);
+        point.map(|w| [w.saturating_sub(reach), (w + reach).min(SIDE)])
+    }
+
+    fn have_cells_in_common(a: Point, b: Point) -> bool {
+        let common = |[from, to]: [u32; 2], [other, end]: [u32; 2]| from.max(other) < to.min(end);
+        let [a, b] = [a, b].map(covered);
+        common(a[0], b[0]) && common(a[1], b[1])
+    }
+
+    /// Any point but the grid's corners, which no triangle has in its middle.
+    fn any_point() -> impl Strategy<Value = Point> {
+        [0..=SIDE, 0..=SIDE].prop_filter("a corner", |point| point.iter().any(|w| w % SIDE != 0))
+    }
+
+    proptest! {
+        #[test]
+        fn areas_overlap_where_their_squares_have_cells_in_common(points in prop::collection::vec(any_point(), 0..12)) {
+            let mut areas = Areas::new(LOG2);
+            for point in &points {
+                areas.insert(*point);
+            }
+            prop_assert_eq!(areas.is_empty(), points.is_empty());
+            let all = || (0..=SIDE).flat_map(|y| (0..=SIDE).map(move |x| [x, y])).filter(|p| p.iter().any(|w| w % SIDE != 0));
+            for tried in all() {
+                let finer = |p: &&Point| zeros(**p) <= zeros(tried);
+                let expected = points.iter().filter(finer).any(|p| have_cells_in_common(*p, tried));
+                prop_assert_eq!(areas.overlap(tried), expected, "{:?} among {:?}", tried, &points);
+            }
+            areas.complete();
+            for tried in all() {
+                let expected = points.iter().any(|p| have_cells_in_common(*p, tried));
+                prop_assert_eq!(areas.overlap(tried), expected, "{:?} among all of {:?}", tried, &points);
+            }
+        }
+    }
+}
