@@ -516,14 +516,27 @@ class Trial:
             check(described.get("X-Cache-Status") is None, f"nginx keeps what changes: {described}")
             status = front.get("/scenes/noise", headers={"If-None-Match": described["etag"]})[0]
             check(status == 304, f"through nginx who has a description gets {status} instead of 304")
+            self.long(front, scene)
             servers[1].stop(signal.SIGKILL)
             check(all(front.get(path)[2] == expected[path][2] for path in paths[:100]), "the cache is no use without servers")
+            answer = front.get("/scenes/noise")
+            check(answer[0] == 502 and answer[1].get("Retry-After") == "2", f"without servers nginx says {answer}")
+            check(json.loads(answer[2])["status"] == 502, f"without servers nginx says {answer[2]}")
             local.stop()
             self.too_much(front, paths[0])
         finally:
             proxy.terminate()
             proxy.wait(10)
         return f"{len(paths)} requests, one of two servers killed"
+
+    def long(self, front, scene):
+        """Whatever the length of an address, a server answers it, or it is refused: no server counts as failed for it."""
+        below = f"/scenes/noise/{scene['version']}/terrain/points?d="
+        for length in [*range(2000, 9000, 37), *range(15_000, 18_000, 37)]:
+            batch = (below + "0,0;" * (length // 4))[:length]
+            status, headers, _ = front.get(batch)
+            check(status in (200, 400, 413, 414), f"an address of {len(batch)} bytes: {status}")
+            check(status != 200 or "X-Cache-Status" in headers, "a batch is not kept")
 
     def too_much(self, front, path):
         """Of one address nginx takes so many requests at once, and so many a second; soon it is asked as before."""
@@ -533,6 +546,7 @@ class Trial:
                 # It waits for the rest of the body, which never comes.
                 held.sendall(f"POST {path} HTTP/1.1\r\nHost: here\r\nContent-Length: 9\r\n\r\n".encode())
             self.until(lambda: front.get(path)[0] == 503, "an address may have as many connections as it likes")
+            check(front.get(path)[1].get("Retry-After") == "1", "nginx does not say when to come back")
         self.until(lambda: front.get(path)[0] == 200, "closed connections are counted for ever")
         asked = f"HEAD {path} HTTP/1.1\r\nHost: here\r\n\r\n".encode() * 900
         statuses = []

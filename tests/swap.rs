@@ -6,11 +6,13 @@ use crate::world::{Served, build, options, serve_within};
 use diamantina_client::headless;
 use diamantina_client::terrain::{FrameView, Options, Terrain};
 use diamantina_protocol::diamond::Diamond;
-use diamantina_server::http::Limits;
+use diamantina_server::http::{self, Limits, Server, new_token};
 use diamantina_server::{hierarchy, ingest, sample};
+use std::io::Write as _;
 use std::path::Path;
+use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::{scope, sleep};
+use std::thread::{scope, sleep, spawn};
 use std::time::{Duration, Instant};
 
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -151,4 +153,57 @@ fn a_flight_across_a_swap_goes_on_and_ends_in_the_new_version() {
     let fresh = open(0.5).settle(&camera, PATIENCE);
     assert!(drawn(&view) == drawn(&fresh), "what is drawn is what a new client draws");
     assert!(view.stats.traffic.bytes > fresh.stats.traffic.bytes, "both versions are counted");
+}
+
+/// As a folder on a file server that is away: whoever opens the description waits.
+fn hang(store: &Path) {
+    let description = store.join("scene.json");
+    std::fs::remove_file(&description).unwrap();
+    assert!(Command::new("mkfifo").arg(&description).status().unwrap().success());
+}
+
+#[test]
+fn a_scene_that_does_not_answer_holds_up_neither_tokens_nor_other_scenes_nor_the_end() {
+    let folder = tempfile::tempdir().unwrap();
+    let dem = folder.path().join("dem.tif");
+    sample::write(&dem, 65).unwrap();
+    let make = |name: &str, max_error: f64| {
+        let options = hierarchy::Options { max_error, scene: name.to_owned(), ..options() };
+        let store = folder.path().join(name);
+        (build(&dem, &store, &ingest::Options::default(), &options).scene.version, store)
+    };
+    let ((_, stuck), (_, other)) = (make("a-stuck", 1.0), make("world", 1.0));
+    let tokens = folder.path().join("tokens");
+    let (token, hash) = new_token().unwrap();
+    let line = |scene: &str| format!("{scene} {hash}\n");
+    std::fs::write(&tokens, line("world") + &line("a-stuck")).unwrap();
+    let limits = Limits { reload: 1, ..Limits::default() };
+    let server = Server::open_with(
+        &[stuck.clone(), other],
+        "127.0.0.1:0".parse().unwrap(),
+        &http::Options { limits, tokens: Some(tokens.clone()), ..http::Options::default() },
+    )
+    .unwrap();
+    let address = server.address();
+    let described = |token: &str| {
+        let mut stream = connect(&address);
+        write!(stream, "GET /scenes/world HTTP/1.1\r\nHost: here\r\nAuthorization: Bearer {token}\r\n\r\n")
+            .unwrap();
+        answer(&mut stream)
+    };
+    let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
+    let running = spawn(move || server.run(async { drop(stopped.await) }));
+    hang(&stuck);
+    sleep(Duration::from_secs(2));
+    let (newer, _) = make("world", 0.0);
+    wait("the other scene stays as it was", || described(&token).contains(&newer));
+    let (another, hash) = new_token().unwrap();
+    std::fs::write(&tokens, format!("world {hash}\n") + &line("a-stuck")).unwrap();
+    wait("the token goes on", || described(&token).starts_with("HTTP/1.1 404"));
+    assert!(described(&another).starts_with("HTTP/1.1 200"));
+    drop(stop);
+    wait("the server waits for the scene", || running.is_finished());
+    running.join().unwrap().unwrap();
+    // Whoever waits still is let go.
+    drop(std::fs::File::options().read(true).write(true).open(stuck.join("scene.json")));
 }

@@ -40,11 +40,12 @@ pub use tls::TlsError;
 pub use viewer::ViewerError;
 
 use crate::height::Decoded;
-use crate::store::{Disk, Shared, StoreError};
+use crate::store::{Disk, Shared, Store, StoreError};
 use access::{Access, Caller};
 use answer::Told;
 use blobs::Blobs;
 use front::Front;
+use futures_util::StreamExt as _;
 use metrics::Metrics;
 use scenes::Scenes;
 use sendfile::Files;
@@ -234,7 +235,7 @@ impl Server {
     /// When the async runtime cannot start.
     pub fn run(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), ServeError> {
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
-        runtime.block_on(async move {
+        let ended = runtime.block_on(async move {
             let listener = tokio::net::TcpListener::from_std(self.listener)?;
             let metrics = Arc::new(Metrics::new(self.shared));
             // What is encrypted is written by this process in any case.
@@ -245,10 +246,14 @@ impl Server {
             let (scenes, access, viewer) = (self.scenes, self.access, self.viewer);
             let site = Arc::new(Site { scenes, blobs, decoded, access, viewer, metrics });
             let front = Arc::new(Front::new(Arc::clone(&site), &self.limits));
-            tokio::spawn(watch(site, Arc::clone(&front), self.tls.clone(), self.limits));
+            tokio::spawn(watch_scenes(Arc::clone(&site), self.limits));
+            tokio::spawn(watch_access(site, Arc::clone(&front), self.tls.clone(), self.limits));
             accept::serve(listener, front, self.tls, self.limits, stop).await;
             Ok(())
-        })
+        });
+        // Whoever still waits for a disk or an object store is not waited for.
+        runtime.shutdown_background();
+        ended
     }
 }
 
@@ -263,32 +268,60 @@ pub fn check(stores: &[PathBuf], options: &Options) -> Result<Vec<String>, Serve
     }
     options.web.as_deref().map(Viewer::open).transpose()?;
     // The disk cache may be in use by the server that these settings are for.
+    if let Some((folder, bytes)) = &options.disk_cache {
+        Disk::check_budget(folder, *bytes)?;
+    }
     Ok(Scenes::open(stores, &Arc::default())?.names())
 }
 
-/// Looks for what changes beside the server, as long as it runs: versions of scenes, tokens, certificates.
-async fn watch(site: Arc<Site>, front: Arc<Front>, tls: Option<Arc<Tls>>, limits: Limits) {
-    let every = Duration::from_secs(if limits.reload > 0 { limits.reload.into() } else { 60 });
-    let grace = Duration::from_secs(limits.grace.into());
-    let mut ticks = tokio::time::interval(every);
+/// Scenes that are looked at at once: one whose store does not answer holds up no others.
+const LOOKED_AT_ONCE: usize = 16;
+
+fn ticks(limits: &Limits) -> tokio::time::Interval {
+    let every = if limits.reload > 0 { limits.reload.into() } else { 60 };
+    let mut ticks = tokio::time::interval(Duration::from_secs(every));
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    ticks
+}
+
+/// Does what waits for disks or networks, where others need not wait for it.
+async fn aside(look: impl FnOnce() + Send + 'static) {
+    if tokio::task::spawn_blocking(look).await.is_err() {
+        tracing::error!("looking for what has changed failed; it is tried again");
+    }
+}
+
+/// Looks for other versions of the scenes, as long as the server runs.
+async fn watch_scenes(site: Arc<Site>, limits: Limits) {
+    let grace = Duration::from_secs(limits.grace.into());
+    let mut ticks = ticks(&limits);
+    while limits.reload > 0 {
+        ticks.tick().await;
+        let looks = futures_util::stream::iter(site.scenes.all());
+        // Reading a whole store takes its time, and none of the others'.
+        let look = |store: Arc<Store>| {
+            let site = Arc::clone(&site);
+            aside(move || site.scenes.refresh(&store, grace, &site.metrics))
+        };
+        looks.for_each_concurrent(LOOKED_AT_ONCE, look).await;
+    }
+}
+
+/// Looks for other tokens and certificates, as long as the server runs: no scene holds that up.
+async fn watch_access(site: Arc<Site>, front: Arc<Front>, tls: Option<Arc<Tls>>, limits: Limits) {
+    let mut ticks = ticks(&limits);
     loop {
         ticks.tick().await;
         front.tidy();
-        if limits.reload == 0 {
-            continue;
-        }
-        let (site, tls) = (Arc::clone(&site), tls.clone());
-        // Reading a whole store takes its time, and none of the others'.
-        let looked = tokio::task::spawn_blocking(move || {
-            site.access.refresh();
-            if let Some(tls) = tls {
-                tls.refresh();
-            }
-            site.scenes.refresh(grace, &site.metrics);
-        });
-        if looked.await.is_err() {
-            tracing::error!("looking for what has changed failed; it is tried again");
+        if limits.reload > 0 {
+            let (site, tls) = (Arc::clone(&site), tls.clone());
+            aside(move || {
+                site.access.refresh();
+                if let Some(tls) = tls {
+                    tls.refresh();
+                }
+            })
+            .await;
         }
     }
 }

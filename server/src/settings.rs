@@ -5,6 +5,7 @@
 
 use crate::http::Limits;
 use crate::size::parse_bytes;
+use crate::store::without_credentials;
 use clap::parser::ValueSource;
 use clap::{Arg, ArgMatches, Args, Command, FromArgMatches, ValueEnum};
 use std::collections::HashMap;
@@ -321,8 +322,9 @@ fn line(command: &Command, matches: &ArgMatches, key: &str) -> String {
         .map(|raw| raw.map(|value| value.to_string_lossy().into_owned()).collect())
         .unwrap_or_default();
     let quoted = |value: &String| match value.parse::<i64>() {
-        Ok(number) if key != "stores" => number.to_string(),
-        _ => toml::Value::String(value.clone()).to_string(),
+        // A file may be named 007.
+        Ok(number) if key != "stores" && number.to_string() == *value => number.to_string(),
+        _ => toml::Value::String(without_credentials(value).unwrap_or_else(|| value.clone())).to_string(),
     };
     match values.as_slice() {
         [] if key == "stores" => format!("{key} = []"),
@@ -409,6 +411,13 @@ mod tests {
         ] {
             assert!(printed.contains(line), "{printed}");
         }
+    }
+
+    #[test]
+    fn what_is_printed_has_names_as_they_are_and_no_credentials() {
+        let printed = merged(&["--tokens=007", "s3://user:secret@bucket/x"], "", &[]).unwrap().to_toml();
+        assert!(printed.contains("tokens = \"007\"") && printed.contains("s3://bucket/..."), "{printed}");
+        assert!(!printed.contains("secret"), "{printed}");
     }
 
     #[test]

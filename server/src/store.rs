@@ -45,7 +45,7 @@ pub use compress::compress;
 pub use disk::Disk;
 pub use error::StoreError;
 pub use format::FORMAT;
-pub use objects::is_address;
+pub use objects::{is_address, without_credentials};
 pub use publish::{Published, Publisher};
 pub use read::{Store, number};
 pub use remote::{Counts, Shared};

@@ -501,7 +501,8 @@ impl<'a> Subject<'a> {
     /// Batches have addresses of up to 8000 bytes.
     async fn long_addresses(&self, tell: &mut Tell<'_>) {
         let bytes = self.batch.len();
-        let remedy = "raise the limit on addresses to 16 KiB (nginx: large_client_header_buffers 4 16k)";
+        let remedy = "raise the limit on addresses to 16 KiB (nginx: large_client_header_buffers 4 17k, and \
+             proxy_buffer_size 32k where it keeps answers)";
         tell(match self.server.get(&self.batch).await {
             Ok(found) if found.status == StatusCode::OK && !found.body.is_empty() => {
                 good("long addresses", format!("one of {bytes} bytes gets through"))

@@ -201,9 +201,9 @@ impl Front {
 
     /// Places for an answer, or which limit leaves none.
     ///
-    /// An address has no more of them than are free: one alone gets half of all, and however many of them ask for as much as they
-    /// can, there is as much room left as each has, for whoever comes next (Choudhury and Hahne's dynamic thresholds for
-    /// switches with a shared memory, 1998, with alpha = 1).
+    /// An address has no more of them than are free: one alone gets half of all, and each that takes all it can leaves as much for
+    /// the others (Choudhury and Hahne's dynamic thresholds for switches with a shared memory, 1998, with alpha = 1).
+    /// So it takes a dozen of them to fill what four could else.
     fn places(&self, connection: &Connection) -> Result<[OwnedSemaphorePermit; 2], &'static str> {
         let taken = self.most_of_address.saturating_sub(connection.answers.available_permits());
         let free = self.places.available_permits();

@@ -3,14 +3,18 @@
 use super::limits::Limits;
 
 /// Files that are open besides connections and packs: sockets to object stores, the log, files that are looked at.
-const OTHERS: u64 = 160;
+const OTHERS: u64 = 128;
+
+/// Files that each thread which serves or works for those has open.
+const OF_THREAD: u64 = 8;
 
 pub(super) use system::raise;
 
 /// Lowers the limit on connections to what fits where so many files may be open, some of them packs: at the limit the system
 /// refuses to accept, and who comes then waits without a word.
 pub(super) fn fit(limits: Limits, files: u64, packs: u64) -> Limits {
-    let most = connections(files, packs);
+    let threads = std::thread::available_parallelism().map_or(1, |count| count.get() as u64);
+    let most = connections(files, packs, threads);
     if most >= u64::from(limits.max_connections) {
         return limits;
     }
@@ -25,9 +29,11 @@ pub(super) fn fit(limits: Limits, files: u64, packs: u64) -> Limits {
     Limits { max_connections, ..limits }
 }
 
-/// Connections that fit where so many files may be open. Where a scene is replaced the packs of both versions are open.
-fn connections(files: u64, packs: u64) -> u64 {
-    files.saturating_sub(OTHERS + 2 * packs).max(files / 2)
+/// Connections that fit where so many files may be open. Where a scene is replaced the packs of both versions are open. If little
+/// is left, half of that.
+fn connections(files: u64, packs: u64, threads: u64) -> u64 {
+    let comfortable = files.saturating_sub(OTHERS + OF_THREAD * threads + 2 * packs);
+    comfortable.max(files.saturating_sub(packs) / 2).max(1)
 }
 
 #[cfg(target_os = "linux")]
@@ -60,9 +66,9 @@ mod tests {
 
     #[test]
     fn packs_leave_room_for_connections_and_the_other_way_round() {
-        assert_eq!(connections(1 << 20, 0), (1 << 20) - OTHERS);
-        assert_eq!(connections(1024, 100), 1024 - 200 - OTHERS);
-        assert_eq!(connections(256, 0), 128);
-        assert_eq!(connections(64, 1000), 32);
+        assert_eq!(connections(1 << 20, 0, 2), (1 << 20) - 144);
+        assert_eq!(connections(1024, 100, 2), 1024 - 200 - 144);
+        assert_eq!(connections(128, 60, 2), 34);
+        assert_eq!(connections(64, 1000, 2), 1);
     }
 }

@@ -102,54 +102,56 @@ impl Scenes {
         })
     }
 
-    /// Looks whether other versions were published, and goes over to those that are sound. Versions before are
-    /// served for `grace` more.
-    pub(super) fn refresh(&self, grace: Duration, metrics: &Metrics) {
-        for store in self.all() {
-            let name = &store.scene().name;
-            self.change(name, |shown| shown.before.retain(|(_, until)| *until > Instant::now()));
-            let refuse = |version: &str, reason: &dyn std::fmt::Display| {
-                tracing::error!(scene = name, version, %reason, "another version was published, and is not served");
-                metrics.swaps_refused.inc();
-                self.change(name, |shown| shown.refused = Some((version.to_owned(), Instant::now())));
-            };
-            let version = match store.newer() {
-                Ok(None) => continue,
-                Ok(Some(version)) => version,
-                // That is told elsewhere, and says nothing of what is published.
-                Err(StoreError::Away { .. } | StoreError::Unanswered { .. }) => continue,
-                Err(error) => {
-                    self.refuse_once(name, "", || refuse("", &error));
-                    continue;
-                }
-            };
-            self.refuse_once(name, &version, || match sound(&store) {
-                Ok(newer) if newer.scene().name == *name => {
-                    tracing::info!(
-                        scene = name,
-                        version = newer.scene().version,
-                        "another version is served"
-                    );
-                    metrics.swaps.inc();
-                    let told = Arc::new(Told::of(newer.scene()));
-                    self.change(name, |shown| {
-                        shown.told = told;
-                        let before = std::mem::replace(&mut shown.now, Arc::new(newer));
-                        shown.before.push((before, Instant::now() + grace));
-                        shown.refused = None;
-                    });
-                }
-                Ok(newer) => refuse(&version, &format!("it is of a scene named '{}'", newer.scene().name)),
-                // It is looked at again the next time.
-                Err(error @ (StoreError::Away { .. } | StoreError::Unanswered { .. })) => {
-                    tracing::warn!(scene = name, version, %error, "another version cannot be read through yet");
-                }
-                Err(error) => {
+    /// Looks whether another version of a store's scene was published, and goes over to it if that is sound. The version
+    /// before is served for `grace` more.
+    pub(super) fn refresh(&self, store: &Store, grace: Duration, metrics: &Metrics) {
+        let name = &store.scene().name;
+        self.change(name, |shown| shown.before.retain(|(_, until)| *until > Instant::now()));
+        let leave_alone = |version: &str| {
+            self.change(name, |shown| shown.refused = Some((version.to_owned(), Instant::now())))
+        };
+        let refuse = |version: &str, reason: &dyn std::fmt::Display| {
+            tracing::error!(scene = name, version, %reason, "another version was published, and is not served");
+            metrics.swaps_refused.inc();
+            leave_alone(version);
+        };
+        let version = match store.newer() {
+            Ok(None) => return,
+            Ok(Some(version)) => version,
+            // That is told elsewhere, and says nothing of what is published.
+            Err(StoreError::Away { .. } | StoreError::Unanswered { .. }) => return,
+            // Neither does this.
+            Err(error @ StoreError::Io { .. }) => {
+                return self.refuse_once(name, "", || {
+                    tracing::error!(scene = name, %error, "whether there is another version cannot be seen");
                     metrics.failed(&error);
-                    refuse(&version, &error);
-                }
-            });
-        }
+                    leave_alone("");
+                });
+            }
+            Err(error) => return self.refuse_once(name, "", || refuse("", &error)),
+        };
+        self.refuse_once(name, &version, || match sound(store) {
+            Ok(newer) if newer.scene().name == *name => {
+                tracing::info!(scene = name, version = newer.scene().version, "another version is served");
+                metrics.swaps.inc();
+                let told = Arc::new(Told::of(newer.scene()));
+                self.change(name, |shown| {
+                    shown.told = told;
+                    let before = std::mem::replace(&mut shown.now, Arc::new(newer));
+                    shown.before.push((before, Instant::now() + grace));
+                    shown.refused = None;
+                });
+            }
+            Ok(newer) => refuse(&version, &format!("it is of a scene named '{}'", newer.scene().name)),
+            // It is looked at again the next time.
+            Err(error @ (StoreError::Away { .. } | StoreError::Unanswered { .. })) => {
+                tracing::warn!(scene = name, version, %error, "another version cannot be read through yet");
+            }
+            Err(error) => {
+                metrics.failed(&error);
+                refuse(&version, &error);
+            }
+        });
     }
 
     /// Does something about a version, unless it was refused not long ago.

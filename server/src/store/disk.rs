@@ -84,15 +84,25 @@ pub struct Disk {
 }
 
 impl Disk {
+    /// Whether so many bytes are enough.
+    ///
+    /// # Errors
+    /// When they are not.
+    pub fn check_budget(root: &Path, budget: u64) -> Result<(), StoreError> {
+        if budget >= BUDGET_MIN {
+            return Ok(());
+        }
+        let what = format!("--disk-cache-size {budget}: expected at least {BUDGET_MIN} bytes");
+        Err(StoreError::DiskCache { path: root.to_owned(), what })
+    }
+
     /// Uses a folder, which no other server may use; what an earlier one kept there stays.
     ///
     /// # Errors
     /// When the folder cannot be written, another program uses it, it holds something else, or the budget is too small.
     pub fn open(root: &Path, budget: u64) -> Result<Self, StoreError> {
+        Self::check_budget(root, budget)?;
         let refused = |what: String| StoreError::DiskCache { path: root.to_owned(), what };
-        if budget < BUDGET_MIN {
-            return Err(refused(format!("--disk-cache-size {budget}: expected at least {BUDGET_MIN} bytes")));
-        }
         fs::create_dir_all(root)
             .map_err(|e| refused(format!("the folder cannot be made ({e}): choose another one")))?;
         let mut kept = Vec::new();

@@ -130,6 +130,15 @@ fn masked(word: &str) -> Cow<'_, str> {
     parts.map_or(Cow::Borrowed(word), |(scheme, rest)| Cow::Owned(format!("{scheme}://{rest}")))
 }
 
+/// What may be said of an address that has credentials in it, if it is one: it may end in logs.
+pub fn without_credentials(text: &str) -> Option<String> {
+    let (scheme, rest) = text.split_once("://")?;
+    let (authority, _) = rest.split_once('/').unwrap_or((rest, ""));
+    // Azure's have the container there.
+    let hidden = authority.rsplit_once('@').filter(|_| !scheme.starts_with("ab"));
+    hidden.map(|(_, host)| format!("{scheme}://{host}/..."))
+}
+
 impl Failure {
     /// The same as an error about an address.
     pub(super) fn at(self, address: String) -> StoreError {
@@ -222,12 +231,7 @@ impl Objects {
     /// When the address is none, or the environment lacks what the store needs.
     pub(super) fn open(path: &Path, manner: Manner) -> Result<Self, StoreError> {
         let text = path.to_string_lossy();
-        // What is said of it may end in logs: never what stands before an @.
-        let masked = text.split_once("://").and_then(|(scheme, rest)| {
-            let (authority, _) = rest.split_once('/').unwrap_or((rest, ""));
-            let hidden = authority.rsplit_once('@').filter(|_| !scheme.starts_with("ab"));
-            hidden.map(|(_, host)| format!("{scheme}://{host}/..."))
-        });
+        let masked = without_credentials(&text);
         let address = masked.clone().unwrap_or_else(|| text.trim_end_matches('/').to_owned());
         let wrong =
             |reason: &str| StoreError::Address { address: address.clone(), reason: reason.to_owned() };
