@@ -40,12 +40,11 @@ pub use tls::TlsError;
 pub use viewer::ViewerError;
 
 use crate::height::Decoded;
-use crate::store::{Disk, Shared, Store, StoreError};
+use crate::store::{Disk, Shared, StoreError};
 use access::{Access, Caller};
 use answer::Told;
 use blobs::Blobs;
 use front::Front;
-use futures_util::StreamExt as _;
 use metrics::Metrics;
 use scenes::Scenes;
 use sendfile::Files;
@@ -246,7 +245,9 @@ impl Server {
             let (scenes, access, viewer) = (self.scenes, self.access, self.viewer);
             let site = Arc::new(Site { scenes, blobs, decoded, access, viewer, metrics });
             let front = Arc::new(Front::new(Arc::clone(&site), &self.limits));
-            tokio::spawn(watch_scenes(Arc::clone(&site), self.limits));
+            for name in site.scenes.names() {
+                tokio::spawn(watch_scene(Arc::clone(&site), name, self.limits));
+            }
             tokio::spawn(watch_access(site, Arc::clone(&front), self.tls.clone(), self.limits));
             accept::serve(listener, front, self.tls, self.limits, stop).await;
             Ok(())
@@ -274,9 +275,6 @@ pub fn check(stores: &[PathBuf], options: &Options) -> Result<Vec<String>, Serve
     Ok(Scenes::open(stores, &Arc::default())?.names())
 }
 
-/// Scenes that are looked at at once: one whose store does not answer holds up no others.
-const LOOKED_AT_ONCE: usize = 16;
-
 fn ticks(limits: &Limits) -> tokio::time::Interval {
     let every = if limits.reload > 0 { limits.reload.into() } else { 60 };
     let mut ticks = tokio::time::interval(Duration::from_secs(every));
@@ -291,19 +289,16 @@ async fn aside(look: impl FnOnce() + Send + 'static) {
     }
 }
 
-/// Looks for other versions of the scenes, as long as the server runs.
-async fn watch_scenes(site: Arc<Site>, limits: Limits) {
+/// Looks for other versions of a scene, as long as the server runs. Each scene is looked at by itself: a store that does not answer,
+/// or is being read through, holds up no other.
+async fn watch_scene(site: Arc<Site>, name: String, limits: Limits) {
     let grace = Duration::from_secs(limits.grace.into());
     let mut ticks = ticks(&limits);
     while limits.reload > 0 {
         ticks.tick().await;
-        let looks = futures_util::stream::iter(site.scenes.all());
-        // Reading a whole store takes its time, and none of the others'.
-        let look = |store: Arc<Store>| {
-            let site = Arc::clone(&site);
-            aside(move || site.scenes.refresh(&store, grace, &site.metrics))
-        };
-        looks.for_each_concurrent(LOOKED_AT_ONCE, look).await;
+        let Some(store) = site.scenes.newest(&name) else { return };
+        let site = Arc::clone(&site);
+        aside(move || site.scenes.refresh(&store, grace, &site.metrics)).await;
     }
 }
 

@@ -67,6 +67,9 @@ pub enum LodError {
     /// There is no client to fly with.
     #[error(transparent)]
     NoClient(#[from] NoClient),
+    /// There is nowhere to fly.
+    #[error("the DEM is one sample: a larger one is needed to fly over it")]
+    Point,
     /// The client failed.
     #[error("the client could not fly '{flight}': {message}")]
     Client {
@@ -131,7 +134,6 @@ pub(super) fn run(whole: &Whole<'_>) -> Result<Report, ExperimentError> {
             if plain.as_ref().is_none_or(|p| p.flight != flown.flight) {
                 plain = Some(flown.clone());
             }
-            let saved = |own: f64, all: f64| format!("{:.1}", 100.0 * (1.0 - own / all.max(1.0)));
             let Some(all) = &plain else { continue };
             table.push([
                 name.clone(),
@@ -158,6 +160,11 @@ pub(super) fn run(whole: &Whole<'_>) -> Result<Report, ExperimentError> {
             + &format!("{foveation}."),
     ];
     Ok(Report { title: "Level of detail".to_owned(), notes, tables: vec![table], pictures })
+}
+
+/// Percent that are saved where all would be so many; of nothing, nothing.
+fn saved(own: f64, all: f64) -> String {
+    format!("{:.1}", if all > 0.0 { 100.0 * (1.0 - own / all) } else { 0.0 })
 }
 
 /// The bytes received up to each frame, a plot a flight.
@@ -189,6 +196,9 @@ fn fly_over(source: &Source, plan: &Options, progress: &Progress) -> Result<Vec<
     let work = tempfile::Builder::new().prefix("diamantina-lod").tempdir_in(&folder).map_err(at(&folder))?;
     let store = work.path().join("scene");
     let scene = hierarchy::build(source, &store, &hierarchy::Options::new("flight"), progress)?.scene;
+    if scene.layers.iter().all(|layer| layer.samples == [1, 1]) {
+        return Err(LodError::Point);
+    }
     let server = Server::open(&[store], SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))?;
     let url = format!("{}/scenes/{}", server.address(), scene.name);
     let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
@@ -236,7 +246,8 @@ fn fly_all(
             let failed = |message: String| LodError::Client { flight, message };
             let output = command.output().map_err(|error| failed(error.to_string()))?;
             if !output.status.success() {
-                return Err(failed(String::from_utf8_lossy(&output.stderr).trim().to_owned()));
+                let told = String::from_utf8_lossy(&output.stderr).trim().to_owned();
+                return Err(failed(if told.is_empty() { output.status.to_string() } else { told }));
             }
             let csv = String::from_utf8_lossy(&output.stdout);
             let flown = read(&csv, flight, terms.name).ok_or_else(|| failed(format!("it wrote {csv:?}")))?;

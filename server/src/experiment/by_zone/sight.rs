@@ -172,7 +172,7 @@ impl<'a> Sight<'a> {
                 });
                 points.map(|points| plot::Series { name: name.to_owned(), points })
             });
-            let azimuth = "azimuth [degrees from east]";
+            let azimuth = "azimuth [degrees from east to north]";
             let axes = [azimuth, "elevation [degrees]"];
             let title = format!("{}, {}: skyline from the zone", self.window.label(), pair.kind);
             pictures.push(Picture {
