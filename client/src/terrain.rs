@@ -128,6 +128,8 @@ pub struct Terrain {
     opened: Instant,
     /// Whether the lines around triangles are drawn, which take room on the GPU.
     wires: bool,
+    /// What frames take of the GPU's memory besides imagery and diamonds.
+    gpu_taken: u64,
     /// How many times the error what is mirrored may have, where it is asked for.
     mirrors: Option<f64>,
     /// What the last frame saw; nothing before the first.
@@ -245,6 +247,7 @@ impl Terrain {
             traffic_before: Traffic::default(),
             opened,
             wires: false,
+            gpu_taken: 0,
             mirrors: None,
             planes: None,
             stats: Stats::default(),

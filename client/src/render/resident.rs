@@ -74,7 +74,6 @@ type Key = (usize, Diamond);
 
 /// All surfaces on the GPU.
 pub(super) struct Residents {
-    budget_bytes: u64,
     bytes: u64,
     frame: u64,
     by_key: HashMap<Key, Resident>,
@@ -82,8 +81,8 @@ pub(super) struct Residents {
 }
 
 impl Residents {
-    pub(super) fn new(budget_bytes: u64) -> Self {
-        Self { budget_bytes, bytes: 0, frame: 0, by_key: HashMap::new(), by_form: HashMap::new() }
+    pub(super) fn new() -> Self {
+        Self { bytes: 0, frame: 0, by_key: HashMap::new(), by_form: HashMap::new() }
     }
 
     /// Bytes of GPU memory that surfaces take.
@@ -105,8 +104,8 @@ impl Residents {
         self.by_form.get(&Form::of(item.surface.points()?.block()))
     }
 
-    /// Starts a frame that draws these items, and these at rest in mirrors: uploads those that are not there yet, and drops others if
-    /// they exceed the budget. Returns the bytes uploaded. Items of unknown layers are passed over.
+    /// Starts a frame that draws these items, and these at rest in mirrors: uploads those that are not there yet, and drops others
+    /// where all would take more than `room_bytes`. Returns the bytes uploaded. Items of unknown layers are passed over.
     pub(super) fn start_frame<'a>(
         &mut self,
         device: &wgpu::Device,
@@ -114,17 +113,23 @@ impl Residents {
         items: &'a [DrawItem],
         mirrored: impl Iterator<Item = &'a DrawItem> + Clone,
         wires: bool,
+        room_bytes: u64,
     ) -> u64 {
         self.frame += 1;
         let mut coming_bytes = 0;
         let all = items.iter().map(|item| (item, true)).chain(mirrored.map(|item| (item, false)));
-        for (item, _) in all.clone() {
+        for (item, moves) in all.clone() {
             match self.by_key.get_mut(&(item.layer, item.diamond)) {
-                Some(resident) => resident.last_frame = self.frame,
+                Some(resident) => {
+                    resident.last_frame = self.frame;
+                    if moves && !resident.moves_as(item) {
+                        coming_bytes += item.motion_bytes();
+                    }
+                }
                 None => coming_bytes += item.gpu_bytes(wires),
             }
         }
-        self.shrink(self.budget_bytes.saturating_sub(coming_bytes));
+        self.shrink(room_bytes.saturating_sub(coming_bytes));
         let mut uploaded_bytes = 0;
         for (item, moves) in all {
             let Some(layer) = layers.get(item.layer) else { continue };
@@ -160,7 +165,7 @@ impl Residents {
                 self.bytes -= old.bytes;
             }
         }
-        self.shrink(self.budget_bytes);
+        self.shrink(room_bytes);
         uploaded_bytes
     }
 
@@ -236,13 +241,18 @@ impl Resident {
         Self { surface, points, own, motion: None, bounds, bytes, last_frame: frame }
     }
 
+    /// Whether it has the motion of the item and no other.
+    fn moves_as(&self, item: &DrawItem) -> bool {
+        let wanted = item.moving.as_ref().map(|moving| Arc::as_ptr(&moving.motion));
+        self.motion.as_ref().map(|buffer| buffer.motion.as_ptr()) == wanted
+    }
+
     /// Has the motion of the item and no other. Returns the bytes uploaded.
     fn move_as(&mut self, device: &wgpu::Device, item: &DrawItem) -> u64 {
-        let wanted = item.moving.as_ref().map(|moving| &moving.motion);
-        let here = self.motion.as_ref().map(|buffer| buffer.motion.as_ptr());
-        if here == wanted.map(Arc::as_ptr) {
+        if self.moves_as(item) {
             return 0;
         }
+        let wanted = item.moving.as_ref().map(|moving| &moving.motion);
         self.bytes -= self.motion.take().map_or(0, |old| old.records.size());
         let slots = item.surface.points().map(|points| points.normals().len());
         let Some(motion) = wanted.filter(|m| slots == Some(m.records().len())) else {

@@ -228,6 +228,11 @@ impl Viewer {
         self.terrain.suit_blocks(suits);
     }
 
+    /// See [`Terrain::set_gpu_taken`].
+    pub fn set_gpu_taken(&mut self, bytes: u64) {
+        self.terrain.set_gpu_taken(bytes);
+    }
+
     /// What the last frame shows.
     #[must_use]
     pub fn frame(&self) -> &FrameView {

@@ -9,17 +9,17 @@ fn light(byte: u8) -> f64 {
     if c <= 0.040_45 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
 }
 
-const CALM: Water = PLAIN.water;
+pub(super) const CALM: Water = PLAIN.water;
 
 /// Land and water over the same forest; water level at a height in metres.
-struct Shore {
-    layers: [Layer; 2],
-    items: Vec<DrawItem>,
-    land: World,
+pub(super) struct Shore {
+    pub(super) layers: [Layer; 2],
+    pub(super) items: Vec<DrawItem>,
+    pub(super) land: World,
 }
 
 impl Shore {
-    fn new(level_metres: f64, height: impl Fn(u32, u32) -> i32) -> Self {
+    pub(super) fn new(level_metres: f64, height: impl Fn(u32, u32) -> i32) -> Self {
         let forest = Forest::new(6, 4, [1, 1]).unwrap();
         let land = World::new(forest, 10.0, height);
         let mut water = World::new(forest, 10.0, |_, _| (level_metres * 10.0) as i32);
