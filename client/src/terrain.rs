@@ -381,7 +381,7 @@ impl Terrain {
 
     /// Takes in what has arrived, says what to draw, and asks for what is missing. The camera's heights are
     /// multiplied, if those of the terrain are. Never waits; takes about a microsecond for each diamond that
-    /// the cut looks at, and some 0.2 ms for each motion that begins, up to [`morph::STARTS_MAX`].
+    /// the cut looks at, and 1.5 ms where as many motions begin as may: [`morph::STARTS_MAX`].
     pub fn frame(&mut self, camera: &Camera) -> FrameView {
         self.frame_at(camera, self.opened.elapsed().as_secs_f64())
     }

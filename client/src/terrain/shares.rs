@@ -20,7 +20,7 @@
 use super::LayerState;
 use super::steps::Steps;
 use crate::cache::PAGES_MAX;
-use crate::morph::{MOTIONS_MAX, Record};
+use crate::morph::{MOTIONS_MAX, Record, STARTS_MAX};
 use crate::surface::Points;
 #[cfg(doc)]
 use crate::texture::TILES_MIN;
@@ -95,6 +95,7 @@ impl Shares {
             state.gpu_bytes = gpu_bytes / shown as u64;
             state.pages_max = (self.pages / shown).clamp(PAGES_MIN, PAGES_MAX);
             state.morphs.set_motions_max((self.motions / shown).clamp(MOTIONS_MIN, MOTIONS_MAX));
+            state.morphs.set_starts_max(STARTS_MAX / shown);
         }
     }
 }
