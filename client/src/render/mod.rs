@@ -213,6 +213,8 @@ struct Instance {
     /// The first tile of imagery, and where in it the eye is and what a metre is.
     tile: u32,
     drape: [f32; 4],
+    /// How large its triangles are in the mean, in metres: the side of a square of two.
+    triangle: f32,
 }
 
 /// A draw: an item of the frame that is in view.
@@ -542,6 +544,24 @@ impl Renderer {
     }
 }
 
+/// The side of a square of two triangles of an item, as large as they are in the mean, in metres.
+fn triangle_metres(layer: &Layer, item: &DrawItem) -> f64 {
+    let local = layer.forest.local(item.diamond);
+    let metres = |[x, y]: [i64; 2]| [x as f64 * layer.cell[0], y as f64 * layer.cell[1]];
+    let ([a, b], [c, d]) = (metres(local.u), metres(local.v));
+    let cell = (a * d - b * c).abs();
+    let squares = match &*item.surface {
+        Surface::Points(points) if points.block().has_centres() => 2.0,
+        Surface::Points(_) => 1.0,
+        Surface::Tin(tin) => {
+            // Half of a diamond lies beyond the forest's rim, if it is not upper.
+            let cells = layer.forest.segments_at(item.diamond.level()).pow(2) as f64;
+            tin.triangles() as f64 / if local.upper { 2.0 } else { 1.0 } / cells
+        }
+    };
+    (cell / squares.max(1e-9)).sqrt()
+}
+
 /// Whether an item is drawn as water, by passes of its own.
 fn is_water(layers: &[Layer], item: &DrawItem, look: &Look) -> bool {
     let is_water = layers.get(item.layer).is_some_and(|layer| layer.kind == message::Kind::Water);
@@ -632,6 +652,7 @@ impl Lens {
                     duration,
                     tile: start.node,
                     drape: start.place,
+                    triangle: single(triangle_metres(&layers[layer], draw.item)),
                 }
             })
             .collect();
