@@ -217,6 +217,16 @@ struct Instance {
     triangle: f32,
 }
 
+/// What is drawn of items.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum What {
+    Triangles,
+    /// And the ring around those of water.
+    Ringed,
+    /// The lines around triangles.
+    Lines,
+}
+
 /// A draw: an item of the frame that is in view.
 struct Draw<'a> {
     item: &'a DrawItem,
@@ -389,11 +399,13 @@ impl Renderer {
             let mut pass = begin_pass(&mut encoder, &attachments, target, look, self.options.format);
             pass.set_bind_group(2, self.drapes.group(), &[]);
             match self.wires.as_ref().filter(|_| look.wireframe) {
-                None => self.draw_surfaces(&mut pass, &lens, land, 0, &self.filled, false, &mut stats),
+                None => {
+                    self.draw_surfaces(&mut pass, &lens, land, 0, &self.filled, What::Triangles, &mut stats)
+                }
                 Some([behind, lines]) => {
-                    self.draw_surfaces(&mut pass, &lens, land, 0, behind, false, &mut stats);
+                    self.draw_surfaces(&mut pass, &lens, land, 0, behind, What::Triangles, &mut stats);
                     let mut uncounted = FrameStats::default();
-                    self.draw_surfaces(&mut pass, &lens, land, 0, lines, true, &mut uncounted);
+                    self.draw_surfaces(&mut pass, &lens, land, 0, lines, What::Lines, &mut uncounted);
                 }
             }
             if let Some(water) = &water {
@@ -482,7 +494,7 @@ impl Renderer {
         draws
     }
 
-    /// Draws the triangles of the items, or the lines around them.
+    /// Draws the triangles of the items, with the ring around them or without, or the lines around each of them.
     ///
     /// The draws are those that `lens` was told of, from the one with this number on.
     #[allow(clippy::too_many_arguments, reason = "a pass is told by so many things, each of its own type")]
@@ -493,7 +505,7 @@ impl Renderer {
         draws: &[Draw<'_>],
         first_instance: u32,
         pipelines: &Pipelines,
-        lines: bool,
+        what: What,
         stats: &mut FrameStats,
     ) {
         let (Some((_, layer_group)), Some(instances)) = (&lens.layers, &lens.instances) else { return };
@@ -523,7 +535,7 @@ impl Renderer {
             }
             if !triangles_now.is_some_and(|now| std::ptr::eq(now, triangles)) {
                 triangles_now = Some(triangles);
-                let indices = if lines { triangles.lines.as_ref() } else { None };
+                let indices = if what == What::Lines { triangles.lines.as_ref() } else { None };
                 pass.set_index_buffer(
                     indices.unwrap_or(&triangles.indices).slice(..),
                     wgpu::IndexFormat::Uint16,
@@ -533,11 +545,12 @@ impl Renderer {
             if let Some(motion) = &resident.motion {
                 pass.set_vertex_buffer(3, motion.records.slice(..));
             }
-            for range in runs(&triangles.sides, draw.sides) {
+            let ring = runs(&triangles.ring, if what == What::Ringed { draw.sides } else { 0 });
+            for range in runs(&triangles.sides, draw.sides).chain(ring) {
                 stats.draws += 1;
                 stats.triangles += u64::from((range.end - range.start) / 3);
                 // Each index of a triangle begins a line of two.
-                let range = if lines { 2 * range.start..2 * range.end } else { range };
+                let range = if what == What::Lines { 2 * range.start..2 * range.end } else { range };
                 pass.draw_indexed(range, 0, instance..instance + 1);
             }
         }

@@ -8,11 +8,12 @@
 use crate::camera::Bounds;
 use crate::drawing::DrawItem;
 use crate::morph::Motion;
+use crate::surface::rim::{Rim, rim};
 use crate::surface::triangles::{self, Form, Lists};
 use crate::surface::{Points, Surface, Tin};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::Diamond;
-use diamantina_protocol::message::Layer;
+use diamantina_protocol::message::{Kind, Layer};
 use glam::DVec3;
 use std::collections::HashMap;
 use std::ops::Range;
@@ -41,6 +42,8 @@ pub(super) struct Triangles {
     pub(super) indices: wgpu::Buffer,
     /// Where each side's list lies.
     pub(super) sides: [Range<u32>; 4],
+    /// Where the lists of the ring around them lie, of water.
+    pub(super) ring: [Range<u32>; 4],
     /// The lines around the triangles, if they are wanted: for each index two, from its vertex to the next one's.
     pub(super) lines: Option<wgpu::Buffer>,
 }
@@ -218,7 +221,15 @@ impl Triangles {
             contents: bytemuck::cast_slice(&indices),
             usage: wgpu::BufferUsages::INDEX,
         });
-        Self { indices, sides: lists.sides, lines }
+        Self { indices, sides: lists.sides, ring: [const { 0..0 }; 4], lines }
+    }
+
+    /// Those of water, and of the ring around it.
+    fn ringed(device: &wgpu::Device, mut lists: Lists, ring: Lists, wires: bool) -> Self {
+        let first = u32::try_from(lists.indices.len()).unwrap_or(0);
+        lists.indices.extend(ring.indices);
+        let ring = ring.sides.map(|side| first + side.start..first + side.end);
+        Self { ring, ..Self::new(device, lists, wires) }
     }
 
     /// Bytes of GPU memory that they take.
@@ -230,6 +241,9 @@ impl Triangles {
 impl Resident {
     fn upload(device: &wgpu::Device, layer: &Layer, item: &DrawItem, frame: u64, wires: bool) -> Self {
         let (points, own, range) = match &*item.surface {
+            Surface::Points(points) if layer.kind == Kind::Water && points.has_nodata() => {
+                upload_water(device, layer, item.diamond, points, wires)
+            }
             Surface::Points(points) => upload_points(device, points, wires),
             Surface::Tin(tin) => upload_tin(device, tin, wires),
         };
@@ -292,6 +306,29 @@ fn upload_points(device: &wgpu::Device, points: &Points, wires: bool) -> Uploade
     let own = points.has_nodata().then(|| Triangles::new(device, triangles::lists_of(points.block()), wires));
     let range = range(heights.iter().copied().filter(|h| *h != NODATA));
     (vertices(device, bytemuck::cast_slice(&all)), own, range)
+}
+
+/// Water that is not everywhere: it has a ring around it that runs on under the ground, as far as there are samples.
+fn upload_water(
+    device: &wgpu::Device,
+    layer: &Layer,
+    diamond: Diamond,
+    points: &Points,
+    wires: bool,
+) -> Uploaded {
+    let (block, local) = (points.block(), layer.forest.local(diamond));
+    let is_within = |[p, q]: [u16; 2]| {
+        (0..2).all(|i| {
+            let at = local.origin[i] + (local.u[i] * i64::from(p) + local.v[i] * i64::from(q)) / 2;
+            (0..i64::from(layer.samples[i])).contains(&at)
+        })
+    };
+    let Rim { heights, lists } = rim(block, is_within);
+    let all: Vec<SurfacePoint> =
+        heights.iter().zip(points.normals()).map(|(h, normal)| point(*h, *normal)).collect();
+    let own = Triangles::ringed(device, triangles::lists_of(block), lists, wires);
+    let range = range(heights.iter().copied().filter(|h| *h != NODATA));
+    (vertices(device, bytemuck::cast_slice(&all)), Some(own), range)
 }
 
 fn upload_tin(device: &wgpu::Device, tin: &Tin, wires: bool) -> Uploaded {

@@ -13,7 +13,7 @@ use super::frame::single;
 use super::pipelines::{Mode, Pipelines, Target, sky_pipeline, terrain_pipelines};
 use super::room::pixels;
 use super::view::View;
-use super::{DEPTH, Draw, FrameStats, Lens, Look, Renderer, clear_colour, is_water};
+use super::{DEPTH, Draw, FrameStats, Lens, Look, Renderer, What, clear_colour, is_water};
 use crate::camera::Camera;
 use crate::drawing::DrawItem;
 use crate::mirror::mean_height;
@@ -403,7 +403,7 @@ impl WaterPasses {
         for draws in water.chunk_by(|a, b| a.item.layer == b.item.layer) {
             if let Some(mirror) = draws.first().and_then(|draw| self.mirrors.get(&draw.item.layer)) {
                 pass.set_bind_group(2, &mirror.group, &[]);
-                renderer.draw_surfaces(pass, lens, draws, first, &self.surfaces, false, stats);
+                renderer.draw_surfaces(pass, lens, draws, first, &self.surfaces, What::Ringed, stats);
             }
             first += u32::try_from(draws.len()).unwrap_or(0);
         }
@@ -441,6 +441,6 @@ fn draw_sheet(
         ..Default::default()
     });
     pass.set_bind_group(2, renderer.drapes.group(), &[]);
-    renderer.draw_surfaces(&mut pass, lens, land, 0, pipelines, false, stats);
+    renderer.draw_surfaces(&mut pass, lens, land, 0, pipelines, What::Triangles, stats);
     lens.draw_sky(&mut pass, sky, look);
 }

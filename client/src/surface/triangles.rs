@@ -86,13 +86,20 @@ pub(crate) fn lists(form: Form, keep: impl Fn(usize) -> bool) -> Lists {
             }
         }
     }
-    let mut end = 0;
-    let sides = parts.each_ref().map(|part| {
-        let start = end;
-        end += u32::try_from(part.len()).unwrap_or(0);
-        start..end
-    });
-    Lists { indices: parts.concat(), sides }
+    Lists::of(&parts)
+}
+
+impl Lists {
+    /// Those of the four sides.
+    pub(crate) fn of(parts: &[Vec<u16>; 4]) -> Self {
+        let mut end = 0;
+        let sides = parts.each_ref().map(|part| {
+            let start = end;
+            end += u32::try_from(part.len()).unwrap_or(0);
+            start..end
+        });
+        Self { indices: parts.concat(), sides }
+    }
 }
 
 /// The lists of a diamond with nodata: triangles with a point that has no height are dropped.
