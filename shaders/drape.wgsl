@@ -14,7 +14,7 @@
 const INNER: f32 = 248.0;
 const SIDE: f32 = 256.0;
 const GUTTER: f32 = 4.0;
-// Pictures along each side of a sheet.
+// Pictures in a row of a sheet, and rows of a whole one.
 const ACROSS: u32 = 8u;
 
 fn node_at(number: u32) -> vec4<u32> {
@@ -28,9 +28,11 @@ fn picture_at(node: vec4<u32>, place: vec2<f32>, right: vec2<f32>, down: vec2<f3
     let inside = clamp(place, vec2<f32>(-3.0 / INNER), vec2<f32>(1.0 + 3.0 / INNER));
     // Rows run from north to south.
     let texel = cell * SIDE + GUTTER + INNER * vec2<f32>(inside.x, 1.0 - inside.y);
-    let scale = vec2<f32>(INNER, -INNER) / (f32(ACROSS) * SIDE);
+    // Where there are few, a sheet has fewer rows.
+    let sheet = vec2<f32>(textureDimensions(pictures));
+    let scale = vec2<f32>(INNER, -INNER) / sheet;
     return textureSampleGrad(
-        pictures, picture_sampler, texel / (f32(ACROSS) * SIDE), i32(node.x / (ACROSS * ACROSS)), right * scale, down * scale,
+        pictures, picture_sampler, texel / sheet, i32(node.x / (ACROSS * ACROSS)), right * scale, down * scale,
     );
 }
 

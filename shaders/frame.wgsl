@@ -21,7 +21,7 @@ struct Frame {
     // rgb: water that mirrors nothing. w: metres from the eye up to the mirror below which nothing is drawn.
     water: vec4<f32>,
     // Imagery: x: how much of the light on the ground it is shown in, 0 to 1. y: how much it hides of what is below it.
-    // z: steps of its sampler.
+    // z: steps of its sampler. And w: radians that a pixel takes.
     drape: vec4<f32>,
     // rgb: colours of land, low to high. w: where each stands in the range of heights, 0 to 1.
     land: array<vec4<f32>, 8>,

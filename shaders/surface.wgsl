@@ -14,6 +14,8 @@ struct Vertex {
     @location(5) about: vec4<i32>,
     // Where in that tile a place lies: xy the eye, zw what a metre is.
     @location(10) drape: vec4<f32>,
+    // How large its triangles are, in metres.
+    @location(11) triangle: f32,
 }
 
 // The motion of a point: see client/src/morph.rs.
@@ -39,6 +41,7 @@ struct Corner {
     @location(4) axes: vec4<i32>,
     @location(5) about: vec4<i32>,
     @location(10) drape: vec4<f32>,
+    @location(11) triangle: f32,
 }
 
 struct Shaded {
@@ -52,13 +55,15 @@ struct Shaded {
     @location(3) @interpolate(flat) tile: u32,
     // Where irregular triangles are seen: in pixels whose number is not below the first, and below the second.
     @location(4) @interpolate(flat) share: vec2<f32>,
+    // How large the triangles are, in metres.
+    @location(5) @interpolate(flat) triangle: f32,
 }
 
 // A lattice point, relative to the reference point, drawn `lift` quanta above its own height. Up to the conversion to
 // f32 all is exact, and from there on a function of the lattice point, the height and the lift alone: so two diamonds
 // give a point that they share the same bits, whether they move or not.
 fn placed(
-    lattice: vec2<i32>, height: i32, lift: f32, normal: vec2<f32>, about: vec4<i32>, drape: vec4<f32>,
+    lattice: vec2<i32>, height: i32, lift: f32, normal: vec2<f32>, about: vec4<i32>, drape: vec4<f32>, triangle: f32,
 ) -> Shaded {
     let across = vec2<f32>(lattice) * layer.cell + layer.offset;
     let still = f32(height - layer.height) * layer.quantum + layer.up_offset;
@@ -71,13 +76,14 @@ fn placed(
         drape.xy + drape.zw * across,
         u32(about.w),
         bitcast<vec2<f32>>(about.yz),
+        triangle,
     );
 }
 
 fn shaded(vertex: Vertex, lift: f32, normal: vec2<f32>) -> Shaded {
     let p = vec2<i32>(vertex.place);
     let lattice = vertex.origin + ((vertex.axes.xy * p.x + vertex.axes.zw * p.y) >> vec2<u32>(1u));
-    return placed(lattice, vertex.height, lift, normal, vertex.about, vertex.drape);
+    return placed(lattice, vertex.height, lift, normal, vertex.about, vertex.drape, vertex.triangle);
 }
 
 @vertex
@@ -98,7 +104,8 @@ fn terrain_morph_vertex(vertex: Vertex, motion: Motion) -> Shaded {
 
 @vertex
 fn tin_vertex(corner: Corner) -> Shaded {
-    return placed(corner.origin + corner.place, corner.height, 0.0, corner.normal, corner.about, corner.drape);
+    let lattice = corner.origin + corner.place;
+    return placed(lattice, corner.height, 0.0, corner.normal, corner.about, corner.drape, corner.triangle);
 }
 
 // Whether triangles are seen in some pixels alone: see client/src/morph.rs.

@@ -115,11 +115,17 @@ fn mirrored_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
     return vec4<f32>(colour.rgb, select(told_distance(length(shaded.from_eye)), 0.5, is_below));
 }
 
-// The sides of triangles.
+// Triangles whose sides are lines of full strength are so large on the screen, in pixels.
+const WIRE_PIXELS: f32 = 8.0;
+
+// The sides of triangles. Lines are a pixel wide, however small the triangles are: where they would be all that is seen, they are as
+// faint as they would be thin if they grew with the triangles, and the ground shows through.
 @fragment
 fn wire_fragment(shaded: Shaded) -> @location(0) vec4<f32> {
     if is_left_out(shaded) {
         discard;
     }
-    return encoded(hazed(vec3<f32>(0.02), shaded.from_eye));
+    let pixels = shaded.triangle / (length(shaded.from_eye) * frame.drape.w);
+    let colour = encoded(hazed(vec3<f32>(0.02), shaded.from_eye));
+    return vec4<f32>(colour.rgb, min(pixels / WIRE_PIXELS, 1.0));
 }

@@ -118,6 +118,20 @@ fn steady(screen: &Screen, what: &str) -> (usize, Vec<[u8; 3]>) {
     }
 }
 
+/// Where the panel begins.
+const PANEL_LEFT: usize = 741;
+
+/// The share of the pixels within a rectangle of the screen in which two pictures differ.
+fn changed_within(
+    (width, a): &(usize, Vec<[u8; 3]>),
+    (_, b): &(usize, Vec<[u8; 3]>),
+    [left, top]: [usize; 2],
+    [right, bottom]: [usize; 2],
+) -> f64 {
+    let inside = || (top..bottom).flat_map(|y| (left..right).map(move |x| y * width + x));
+    inside().filter(|i| a[*i] != b[*i]).count() as f64 / inside().count() as f64
+}
+
 fn view(screen: &Screen, folder: &Path, url: &str) -> Running {
     let mut command = Command::new(&programs().client);
     command.args(["view", url, "--size", "1000x700", "--error-pixels", "4", "--no-antialias"]);
@@ -177,4 +191,26 @@ fn a_window_shows_the_terrain_and_obeys() {
         sleep(Duration::from_millis(50));
     }
     panic!("it does not close");
+}
+
+#[test]
+fn a_click_on_the_ground_marks_the_place_and_the_panel_tells_of_it() {
+    let world = World::sample(257, 0.0);
+    let served = serve(&[world.folder.path().join("store")]);
+    let (screen, folder) = (Screen::start(), tempfile::tempdir().unwrap());
+    let mut viewer = view(&screen, folder.path(), &served.address);
+    let first = steady(&screen, "terrain appears");
+    // A click on the ground marks the place, and the panel tells its height; nothing else changes.
+    let [x, y] = solid(&first);
+    let ([left, top], [right, bottom]) = ([x - 12, y - 12], [x + 12, y + 12]);
+    screen.act(&["mousemove", &x.to_string(), &y.to_string()]);
+    sleep(Duration::from_millis(150));
+    screen.act(&["click", "1"]);
+    sleep(Duration::from_millis(150));
+    let marked = until(&screen, "the click marks", |picture| {
+        let mark = changed_within(picture, &first, [left, top], [right, bottom]);
+        mark > 0.02 && changed_within(picture, &first, [PANEL_LEFT, 560], [980, 690]) > 0.005
+    });
+    assert!(changed_within(&marked, &first, [0, 0], [600, 700]) < 0.01, "the view stays");
+    assert!(viewer.0.try_wait().unwrap().is_none(), "it runs");
 }

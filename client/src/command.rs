@@ -124,7 +124,8 @@ struct ViewArgs {
     /// The imagery to lay on the terrain, or none [default: the scene's first, if it has any]
     #[arg(long, value_name = "NAME|none")]
     texture: Option<String>,
-    /// Memory for tiles of imagery, at most 1000MiB, and as much again on the GPU; where it is too little, imagery is coarser
+    /// Memory for tiles of imagery, at most 1000MiB, and as much again of --gpu-memory, of which they take a third at most; where it
+    /// is too little, imagery is coarser
     #[arg(long, default_value = "128MiB", value_name = "SIZE", value_parser = parse_bytes)]
     texture_memory: u64,
     /// Keep imagery in blocks (BC7) where the graphics card reads them: four times as many tiles in --texture-memory, in colours
@@ -134,8 +135,9 @@ struct ViewArgs {
     /// Memory for decoded diamonds; where it is too little for the error asked for, the view is coarser
     #[arg(long, default_value = "1GiB", value_name = "SIZE", value_parser = parse_bytes)]
     memory: u64,
-    /// GPU memory for the diamonds that are drawn and their motions; where it is too little, the view is coarser. The
-    /// pictures that a frame is made of come on top: some 36 bytes a pixel, 8 with --no-antialias, and with water 16 more
+    /// GPU memory for all that is drawn: first the pictures that a frame is made of (some 40 bytes a pixel, 12 with
+    /// --no-antialias, and with water 16 more), then imagery, then diamonds and their motions. Where it is too little, the view is
+    /// coarser; where there is no room for the pictures, render and fly fail
     #[arg(long, default_value = "512MiB", value_name = "SIZE", value_parser = parse_bytes)]
     gpu_memory: u64,
     #[command(flatten)]
@@ -410,6 +412,13 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
     if args.json.as_ref().is_none_or(|p| p.as_os_str() != "-") {
         shown(print_report(args, &report))?;
     }
+    if report.gpu_total_bytes > args.view.gpu_memory {
+        let _ = writeln!(
+            std::io::stderr(),
+            "notice: {}",
+            too_large(report.gpu_total_bytes, args.view.gpu_memory)
+        );
+    }
     if let Some(words) = headless::below_ground(report.eye[2], report.ground_at_eye) {
         let _ = writeln!(std::io::stderr(), "notice: {words}");
     }
@@ -428,6 +437,14 @@ fn render(args: &RenderArgs) -> Result<(), Failure> {
         format!("its largest error is {:.2} pixels", report.largest_error_pixels)
     };
     Err(Failure(1, format!("{}: written, but {what}: {why}", args.output.display())))
+}
+
+/// What to say where the coarsest diamonds alone are too much for the GPU's memory.
+fn too_large(taken: u64, budget: u64) -> String {
+    let [taken, budget] = [taken, budget].map(|bytes| bytes as f64 / f64::from(1 << 20));
+    format!(
+        "{taken:.1} MiB of GPU memory were taken, of {budget:.1}: the coarsest diamonds are drawn in any case; raise --gpu-memory"
+    )
 }
 
 fn print_report(args: &RenderArgs, r: &PictureReport) -> std::io::Result<()> {
@@ -564,13 +581,14 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
         reads: false,
         patience,
     };
-    let (mut slowest_cut, mut draw_sum, mut last) = (0.0f64, 0.0, None);
+    let (mut slowest_cut, mut draw_sum, mut gpu_most, mut last) = (0.0f64, 0.0, 0, None);
     let mut failed = None;
     let bar = indicatif::ProgressBar::new(args.frames.into());
     let look = args.view.look(&terrain);
     headless::fly(&mut terrain, &path, &flight, &look, &args.view.render_options(), |line, _| {
         slowest_cut = slowest_cut.max(line.cut_ms);
         draw_sum += line.draw_ms;
+        gpu_most = gpu_most.max(line.gpu_total_bytes);
         bar.inc(1);
         if let Some(out) = &mut csv
             && let Err(e) = writeln!(out, "{}", line.csv())
@@ -601,6 +619,10 @@ fn fly(args: &FlyArgs) -> Result<(), Failure> {
             "  {} bytes in {} requests and {} round trips; error at the end {:.2} pixels",
             last.bytes, last.requests, last.round_trips, last.error_pixels
         )?;
+        writeln!(out, "  {:.1} MiB of GPU memory at most", gpu_most as f64 / f64::from(1 << 20))?;
+    }
+    if gpu_most > args.view.gpu_memory {
+        let _ = writeln!(std::io::stderr(), "notice: {}", too_large(gpu_most, args.view.gpu_memory));
     }
     Ok(())
 }

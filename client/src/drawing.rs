@@ -43,9 +43,22 @@ impl DrawItem {
     /// Bytes of GPU memory that it takes at most; with `wires` also the lines around its triangles.
     #[must_use]
     pub fn gpu_bytes(&self, wires: bool) -> u64 {
-        let motion = self.moving.as_ref().map_or(0, |moving| size_of_val(moving.motion.records()) as u64);
-        self.surface.gpu_bytes(wires) + motion
+        self.surface.gpu_bytes(wires) + self.motion_bytes()
     }
+
+    /// Bytes of GPU memory that its motion takes, if it moves.
+    #[must_use]
+    pub fn motion_bytes(&self) -> u64 {
+        self.moving.as_ref().map_or(0, |moving| size_of_val(moving.motion.records()) as u64)
+    }
+}
+
+/// What diamonds and their motions may take of the GPU's memory, where all else takes so much of it: the rest, but for a part that
+/// their places take, which are told anew for each pass of a frame.
+#[must_use]
+pub fn left_for_diamonds(gpu_bytes: u64, taken: u64) -> u64 {
+    let left = gpu_bytes.saturating_sub(taken);
+    left - left / 64
 }
 
 /// What a layer of water mirrors in a frame.

@@ -37,6 +37,20 @@ pub enum HeadlessError {
     /// It cannot be drawn.
     #[error(transparent)]
     Render(#[from] RenderError),
+    /// The GPU's memory is too little for a picture of the size.
+    #[error(
+        "a picture of {} x {} pixels takes {} MiB of GPU memory before anything is drawn, of {} MiB: raise --gpu-memory, or ask for \
+         a smaller --size, --no-antialias or --texture none",
+        size[0], size[1], needed.div_ceil(1 << 20), budget >> 20
+    )]
+    GpuMemory {
+        /// Its size.
+        size: [u32; 2],
+        /// What it takes, in bytes.
+        needed: u64,
+        /// What there is.
+        budget: u64,
+    },
     /// A file cannot be written or read.
     #[error("{path}: cannot {action}: {error}; {}", match error.kind() {
         std::io::ErrorKind::StorageFull | std::io::ErrorKind::QuotaExceeded => "free some space",
@@ -200,8 +214,10 @@ pub struct PictureReport {
     pub resident_bytes: usize,
     /// Bytes of GPU memory that the drawn diamonds take.
     pub gpu_bytes: u64,
-    /// Bytes of GPU memory that the picture itself takes, and what all diamonds share: see [`FrameStats::fixed_bytes`].
+    /// Bytes of GPU memory that all else takes: see [`FrameStats::fixed_bytes`].
     pub gpu_fixed_bytes: u64,
+    /// Both together.
+    pub gpu_total_bytes: u64,
     /// Milliseconds to draw the finished picture.
     pub milliseconds_a_frame: f64,
 }
@@ -210,7 +226,7 @@ pub struct PictureReport {
 /// and draws what is there. Where the look stretches heights, the camera's are stretched, too.
 ///
 /// # Errors
-/// When there is no graphics adapter.
+/// When there is no graphics adapter, or no memory on it for such a picture.
 pub fn picture(
     terrain: &mut Terrain,
     camera: &Camera,
@@ -224,6 +240,7 @@ pub fn picture(
     terrain.set_exaggeration(look.exaggeration);
     terrain.set_wires(look.wireframe);
     terrain.set_mirrors(look.mirrors().then_some(look.water.mirror_error));
+    take_room(terrain, &offscreen, camera.size, look)?;
     let view = terrain.settle(&drawn, patience);
     let layers = &terrain.scene().layers;
     offscreen.drape(view.drape.as_ref());
@@ -241,6 +258,22 @@ pub fn picture(
     }
     let report = report(terrain, camera, look, &view, frame, milliseconds_a_frame);
     Ok((picture, report))
+}
+
+/// Takes what pictures of a size take of the GPU's memory from what the terrain may.
+fn take_room(
+    terrain: &mut Terrain,
+    offscreen: &Offscreen,
+    size: [u32; 2],
+    look: &Look,
+) -> Result<(), HeadlessError> {
+    let taken = offscreen.frame_bytes(&terrain.scene().layers, size, look, terrain.waters());
+    terrain.set_gpu_taken(taken);
+    let (needed, budget) = (terrain.gpu_least(), terrain.gpu_budget());
+    if needed > budget {
+        return Err(HeadlessError::GpuMemory { size, needed, budget });
+    }
+    Ok(())
 }
 
 /// Writes what a look asks for over pictures of a scene.
@@ -338,6 +371,7 @@ fn report(
         resident_bytes: view.stats.resident_bytes,
         gpu_bytes: frame.gpu_bytes,
         gpu_fixed_bytes: frame.fixed_bytes,
+        gpu_total_bytes: frame.total_bytes(),
         milliseconds_a_frame,
     }
 }
@@ -384,6 +418,8 @@ pub fn open_text(path: &Path) -> Result<Box<dyn Write>, HeadlessError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::terrain;
+    use crate::world::{Served, above};
 
     #[test]
     fn an_eye_below_the_ground_is_told() {
@@ -394,6 +430,33 @@ mod tests {
         );
         for (eye, ground) in [(12.6, Some(12.5)), (12.5, Some(12.5)), (-9e9, None)] {
             assert_eq!(below_ground(eye, ground), None, "{eye} {ground:?}");
+        }
+    }
+
+    #[test]
+    fn pictures_stay_within_the_gpu_or_are_refused() {
+        let served = Served::start_draped();
+        let patience = Duration::from_secs(20);
+        let look = Look::default();
+        let draw = |gpu_bytes: u64, imagery| {
+            let asked = terrain::Options { gpu_bytes, imagery, ..terrain::Options::default() };
+            let mut terrain = Terrain::open(&served.url, asked).unwrap();
+            let options = render::Options { budget_bytes: gpu_bytes, ..render::Options::default() };
+            picture(&mut terrain, &Camera { size: [320, 200], ..above() }, &look, &options, patience)
+        };
+        let (_, whole) = draw(1 << 30, terrain::Imagery::None).unwrap();
+        assert!(!whole.limited_by_memory);
+        // Places of diamonds so small as these are more than a part of them.
+        let places = 8192 + 112 * u64::from(whole.draws);
+        let budget = whole.gpu_fixed_bytes + whole.gpu_bytes / 2 + places;
+        let (_, half) = draw(budget, terrain::Imagery::None).unwrap();
+        let total = half.gpu_total_bytes;
+        assert!(half.limited_by_memory && total <= budget, "{total} of {budget}");
+        assert_eq!(total, half.gpu_bytes + half.gpu_fixed_bytes);
+        // Not even the picture has room, or there would be without imagery.
+        for (budget, imagery) in [(1 << 20, terrain::Imagery::None), (budget, terrain::Imagery::First)] {
+            let told = draw(budget, imagery).unwrap_err().to_string();
+            assert!(["320 x 200", "--gpu-memory", "--size"].iter().all(|word| told.contains(word)), "{told}");
         }
     }
 

@@ -53,11 +53,12 @@ pub const SECONDS_MAX: f64 = 60.0;
 /// and as much on the GPU.
 pub const MOTIONS_MAX: usize = 512;
 
-/// Motions that begin in one frame, for each layer; some 0.2 ms each. The others begin in the next one.
-pub const STARTS_MAX: usize = 64;
+/// Points whose motions begin in one frame, of all layers; some 28 ns each, so 1.4 ms: six diamonds of n = 64. The others begin
+/// in the next frames. Points are counted, not time: so a flight can be repeated.
+pub const STARTS_MAX: usize = 50_000;
 
-/// Motions that begin in a second, so that frames that follow one another fast are not held up for long.
-const STARTS_A_SECOND: i64 = 1000;
+/// Ticks in which as many begin as may in a frame, 20 ms: frames that follow one another faster begin fewer.
+const STARTS_TICKS: i32 = 328;
 
 /// A moment, in ticks from a beginning that all moments of a scene share. Wraps around.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -266,11 +267,30 @@ struct Scratch {
     before: Vec<Before>,
 }
 
+/// What may still begin in a frame.
+#[derive(Debug, Clone, Copy)]
+struct Starts {
+    points: usize,
+    /// Whether nothing has begun yet: one diamond does in any case, however short the frame or large the diamond.
+    is_first: bool,
+}
+
+impl Starts {
+    fn has_room(&self, points: usize) -> bool {
+        self.is_first || points <= self.points
+    }
+
+    fn take(&mut self, points: usize) {
+        *self = Self { points: self.points.saturating_sub(points), is_first: false };
+    }
+}
+
 /// The motions of a layer, from frame to frame. Bounded by the cut and [`MOTIONS_MAX`].
 #[derive(Debug, Default)]
 pub struct Morphs {
     duration: i32,
     motions_max: usize,
+    starts_max: usize,
     /// The moment of the last frame.
     moment: Option<Moment>,
     /// What the last frame drew as split.
@@ -287,7 +307,12 @@ impl Morphs {
     #[must_use]
     pub fn new(seconds: f64) -> Self {
         let duration = (seconds.min(SECONDS_MAX) * TICKS_A_SECOND) as i32;
-        Self { duration, motions_max: MOTIONS_MAX, ..Self::default() }
+        Self { duration, motions_max: MOTIONS_MAX, starts_max: STARTS_MAX, ..Self::default() }
+    }
+
+    /// Has the motions of no more than so many points begin in a frame, at most [`STARTS_MAX`]; those of one diamond in any case.
+    pub fn set_starts_max(&mut self, points: usize) {
+        self.starts_max = points.min(STARTS_MAX);
     }
 
     /// Has no more than so many diamonds move at a time, at most [`MOTIONS_MAX`].
@@ -313,7 +338,7 @@ impl Morphs {
         self.last = wanted.iter().copied().collect();
     }
 
-    /// Goes on to the next frame: what it draws as split. Costs some 0.2 ms for each motion that begins.
+    /// Goes on to the next frame: what it draws as split. Costs some 0.2 ms for each motion of n = 64 that begins.
     pub fn step(&mut self, change: &Change) -> Cut {
         let forest = change.layer.forest;
         self.motions.retain(|_, motion| motion.merging || !motion.is_over(change.now));
@@ -344,16 +369,18 @@ impl Morphs {
         cut
     }
 
-    /// How many motions may begin in this frame.
-    fn starts(&mut self, now: Moment) -> usize {
-        let ticks = self.moment.replace(now).map(|last| now.since(last));
-        let share = |ticks: i32| 1 + i64::from(ticks) * STARTS_A_SECOND / TICKS_A_SECOND as i64;
-        ticks.and_then(|ticks| usize::try_from(share(ticks)).ok()).map_or(STARTS_MAX, |n| n.min(STARTS_MAX))
+    /// How much may begin in this frame.
+    fn starts(&mut self, now: Moment) -> Starts {
+        let ticks = self.moment.replace(now).map_or(STARTS_TICKS, |last| now.since(last));
+        let part = f64::from(ticks.clamp(0, STARTS_TICKS)) / f64::from(STARTS_TICKS);
+        #[allow(clippy::cast_sign_loss, reason = "a part of it")]
+        let points = (self.starts_max as f64 * part) as usize;
+        Starts { points, is_first: true }
     }
 
     /// Begins or turns the motion of a wanted diamond whose parents are drawn as split, where there is something
     /// to see. Whether it can be drawn as split now.
-    fn grow(&mut self, change: &Change, d: Diamond, starts: &mut usize) -> bool {
+    fn grow(&mut self, change: &Change, d: Diamond, starts: &mut Starts) -> bool {
         let way = if self.last.contains(&d) {
             if !self.motions.get(&d).is_some_and(|motion| motion.merging) {
                 return true;
@@ -374,7 +401,7 @@ impl Morphs {
 
     /// What the last frame drew and nothing wants any more is held while it moves back, finest first; parents
     /// before children.
-    fn hold(&mut self, change: &Change, set: &mut Set, starts: &mut usize) -> Vec<Diamond> {
+    fn hold(&mut self, change: &Change, set: &mut Set, starts: &mut Starts) -> Vec<Diamond> {
         let forest = change.layer.forest;
         let mut lost: Vec<Diamond> = self.last.iter().copied().filter(|d| !set.contains(d)).collect();
         lost.sort_unstable_by_key(|d| (Reverse(d.level()), *d));
@@ -400,7 +427,7 @@ impl Morphs {
     }
 
     /// Moves an unwanted diamond back, in which no other is split. Whether it stays drawn as split.
-    fn merge(&mut self, change: &Change, d: Diamond, starts: &mut usize) -> bool {
+    fn merge(&mut self, change: &Change, d: Diamond, starts: &mut Starts) -> bool {
         if d.level() == 0 || (change.surface)(d).is_none() || !(change.sight)(d).visible {
             return false;
         }
@@ -418,14 +445,14 @@ impl Morphs {
         }
     }
 
-    fn start(&mut self, change: &Change, d: Diamond, way: Way, starts: &mut usize) -> bool {
+    fn start(&mut self, change: &Change, d: Diamond, way: Way, starts: &mut Starts) -> bool {
         let Some(resident) = (change.surface)(d) else { return false };
         let Some(surface) = resident.points() else {
             self.appear(change, d, way);
             return true;
         };
         let is_full = self.motions.len() >= self.motions_max && !self.motions.contains_key(&d);
-        if *starts == 0 || is_full {
+        if is_full || !starts.has_room(surface.normals().len()) {
             return false;
         }
         let parents = change.layer.forest.parents(d);
@@ -445,7 +472,7 @@ impl Morphs {
         };
         let declared = (change.sight)(d).error_metres;
         let motion = start.motion(way, declared, change.layer.quantum, &mut self.scratch);
-        *starts -= 1;
+        starts.take(surface.normals().len());
         if way != Way::Home && !motion.records.iter().any(Record::moves) {
             self.motions.remove(&d);
             return true;

@@ -128,6 +128,8 @@ pub struct Terrain {
     opened: Instant,
     /// Whether the lines around triangles are drawn, which take room on the GPU.
     wires: bool,
+    /// What frames take of the GPU's memory besides imagery and diamonds.
+    gpu_taken: u64,
     /// How many times the error what is mirrored may have, where it is asked for.
     mirrors: Option<f64>,
     /// What the last frame saw; nothing before the first.
@@ -245,6 +247,7 @@ impl Terrain {
             traffic_before: Traffic::default(),
             opened,
             wires: false,
+            gpu_taken: 0,
             mirrors: None,
             planes: None,
             stats: Stats::default(),
@@ -378,7 +381,7 @@ impl Terrain {
 
     /// Takes in what has arrived, says what to draw, and asks for what is missing. The camera's heights are
     /// multiplied, if those of the terrain are. Never waits; takes about a microsecond for each diamond that
-    /// the cut looks at, and some 0.2 ms for each motion that begins, up to [`morph::STARTS_MAX`].
+    /// the cut looks at, and 1.5 ms where as many motions begin as may: [`morph::STARTS_MAX`].
     pub fn frame(&mut self, camera: &Camera) -> FrameView {
         self.frame_at(camera, self.opened.elapsed().as_secs_f64())
     }

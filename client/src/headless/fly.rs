@@ -1,6 +1,6 @@
 //! A flight along a path, with a line of figures for each frame.
 
-use super::{Annotator, FlightPath, HeadlessError, save};
+use super::{Annotator, FlightPath, HeadlessError, save, take_room};
 use crate::overview::stretched;
 use crate::picture::Picture;
 use crate::player::{self, Course};
@@ -84,7 +84,7 @@ pub struct FrameLine {
     pub fictitious_points: u64,
     /// Whether the eye was in the zone that was asked for: see [`super::PictureReport::zone_in_effect`].
     pub zone_in_effect: bool,
-    /// Bytes of GPU memory besides those of surfaces: see [`crate::render::FrameStats::fixed_bytes`].
+    /// Bytes of GPU memory that all else takes: see [`crate::render::FrameStats::fixed_bytes`].
     pub gpu_fixed_bytes: u64,
     /// Bytes so far that were fetched before, and came from the disk.
     pub disk_bytes: u64,
@@ -98,17 +98,19 @@ pub struct FrameLine {
     pub late: usize,
     /// Steps of series that come next and were there already.
     pub steps_ahead: usize,
+    /// Bytes of GPU memory that all takes: those of surfaces and the others.
+    pub gpu_total_bytes: u64,
 }
 
 impl FrameLine {
     /// The heading of the CSV.
-    pub const HEADING: &str = "frame,seconds,cut_ms,draw_ms,error_pixels,goal_pixels,complete,moving,diamonds,triangles,draws,uploaded_bytes,gpu_bytes,resident,resident_bytes,bytes,requests,round_trips,real_points,fictitious_points,zone_in_effect,gpu_fixed_bytes,disk_bytes,offline,limited_by_memory,time_seconds,late,steps_ahead";
+    pub const HEADING: &str = "frame,seconds,cut_ms,draw_ms,error_pixels,goal_pixels,complete,moving,diamonds,triangles,draws,uploaded_bytes,gpu_bytes,resident,resident_bytes,bytes,requests,round_trips,real_points,fictitious_points,zone_in_effect,gpu_fixed_bytes,disk_bytes,offline,limited_by_memory,time_seconds,late,steps_ahead,gpu_total_bytes";
 
     /// The line, with the fields of the heading.
     #[must_use]
     pub fn csv(&self) -> String {
         format!(
-            "{},{:.4},{:.3},{:.3},{:.4},{:.4},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{:.4},{},{}",
+            "{},{:.4},{:.3},{:.3},{:.4},{:.4},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{:.4},{},{},{}",
             self.frame,
             self.seconds,
             self.cut_ms,
@@ -137,6 +139,7 @@ impl FrameLine {
             self.time_seconds,
             self.late,
             self.steps_ahead,
+            self.gpu_total_bytes,
         )
     }
 }
@@ -146,7 +149,7 @@ impl FrameLine {
 /// looks the same however long its frames take.
 ///
 /// # Errors
-/// When there is no graphics adapter, a picture cannot be written, or `each` says so.
+/// When there is no graphics adapter, or no memory on it for such pictures, a picture cannot be written, or `each` says so.
 pub fn fly(
     terrain: &mut Terrain,
     path: &FlightPath,
@@ -162,6 +165,7 @@ pub fn fly(
     let mut annotator: Option<(String, Annotator)> = None;
     terrain.set_wires(look.wireframe);
     terrain.set_mirrors(look.mirrors().then_some(look.water.mirror_error));
+    take_room(terrain, &offscreen, flight.size, look)?;
     let (play, from) = (flight.play, terrain.time());
     let is_playing = play.speed != 0.0;
     let course = is_playing.then_some(Course { is_backward: play.speed < 0.0, is_round: play.is_round });
@@ -238,6 +242,7 @@ pub fn fly(
             time_seconds: terrain.time(),
             late: view.late,
             steps_ahead: view.stats.steps_ahead,
+            gpu_total_bytes: stats.total_bytes(),
         };
         if let (Some(folder), Some(picture)) = (&flight.pictures, &picture) {
             save(picture, &folder.join(format!("frame-{frame:05}.png")))?;
@@ -282,6 +287,7 @@ mod tests {
             time_seconds: 14.5,
             late: 1,
             steps_ahead: 2,
+            gpu_total_bytes: 18,
         };
         assert_eq!(line.csv().split(',').count(), FrameLine::HEADING.split(',').count());
         let json = serde_json::to_value(&line).unwrap();

@@ -1,20 +1,22 @@
 //! Imagery on the GPU: the pictures of tiles, in sheets, and the quadtree that leads a pixel to them.
 //!
-//! All pictures lie in one array of textures, [`ACROSS`] by [`ACROSS`] in each. A second small texture holds the quadtree:
+//! All pictures lie in one array of textures, [`ACROSS`] by [`ACROSS`] in each, or in one of fewer rows. A second small texture holds the quadtree:
 //! see `shaders/drape.wgsl`, which goes down it for each pixel. So what is drawn and how fine its imagery is have nothing
 //! to do with each other, and a diamond of any size may show tiles of any level.
 
 use super::frame::single;
 use super::view::View;
 use crate::camera::Bounds;
-use crate::texture::{Coding, Drape, TileImage, plain, within};
+use crate::texture::{self, Coding, Drape, TileImage, plain, within};
 use diamantina_protocol::texture::{SIDE, Texture, Tile};
 use std::borrow::Cow;
 use std::collections::HashMap;
 use std::sync::{Arc, Weak};
 
-/// Pictures along each side of a sheet: 2048 texels, which any GPU can have. A twin of `ACROSS` in the shader.
+/// Pictures along each side of a whole sheet. A twin of `ACROSS` in the shader, and of [`texture::ROW`].
 const ACROSS: u32 = 8;
+
+const _: () = assert!(texture::ROW == ACROSS as usize && texture::SHEET_ROWS == ACROSS as usize);
 
 /// Pictures in a sheet.
 const IN_SHEET: u32 = ACROSS * ACROSS;
@@ -56,8 +58,12 @@ pub(super) struct Drapes {
     /// The number in the quadtree of each tile shown.
     numbers: HashMap<Tile, u32>,
     told: Vec<Node>,
+    /// What the sheets take.
     bytes: u64,
 }
+
+/// Bytes of the quadtree's texture.
+const NODES_BYTES: u64 = 16 * (NODES_SIDE * NODES_SIDE) as u64;
 
 impl Drapes {
     /// `anisotropy`: how many steps the sampler takes along the longer side of what a pixel shows.
@@ -105,7 +111,7 @@ impl Drapes {
             usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
             view_formats: &[],
         });
-        let sheets = sheets(device, Coding::Plain, SIDE, 1);
+        let sheets = sheets(device, Coding::Plain, [1, 1], 1);
         let group = group(device, &layout, &nodes, &sheets, &sampler);
         Self {
             layout,
@@ -132,19 +138,34 @@ impl Drapes {
         &self.group
     }
 
-    /// Bytes of GPU memory that it takes.
+    /// Bytes of GPU memory that it takes, pictures included.
     pub(super) fn bytes(&self) -> u64 {
+        NODES_BYTES + self.bytes
+    }
+
+    /// Bytes of GPU memory that the pictures take.
+    pub(super) fn pictures_bytes(&self) -> u64 {
         self.bytes
+    }
+
+    /// Bytes that it takes before there is a picture.
+    pub(super) fn least_bytes() -> u64 {
+        NODES_BYTES
     }
 
     /// Shows this imagery from now on, or none. Returns the bytes uploaded.
     pub(super) fn show(&mut self, device: &wgpu::Device, queue: &wgpu::Queue, drape: Option<&Drape>) -> u64 {
         self.texture = drape.map(|drape| Arc::clone(&drape.texture));
         self.numbers.clear();
-        let Some(drape) = drape else { return 0 };
+        let Some(drape) = drape else {
+            if self.capacity > 0 {
+                self.make_room(device, 0, Coding::Plain);
+            }
+            return 0;
+        };
         let coding = if reads_blocks(device) { drape.coding } else { Coding::Plain };
-        if drape.capacity > self.capacity || coding != self.coding {
-            self.grow(device, drape.capacity, coding);
+        if drape.capacity != self.capacity || coding != self.coding {
+            self.make_room(device, drape.capacity, coding);
         }
         let (free, places) = (&mut self.free, &mut self.places);
         let images: HashMap<Tile, &Arc<TileImage>> =
@@ -193,16 +214,20 @@ impl Drapes {
         uploaded
     }
 
-    /// Makes room for so many pictures. Those that were there have to come again.
-    fn grow(&mut self, device: &wgpu::Device, capacity: usize, coding: Coding) {
-        let wanted = u32::try_from(capacity).unwrap_or(u32::MAX).div_ceil(IN_SHEET);
-        let count = wanted.clamp(1, device.limits().max_texture_array_layers);
-        self.sheets = sheets(device, coding, ACROSS * SIDE, count);
+    /// Makes room for so many pictures, or for none. Those that were there have to come again.
+    fn make_room(&mut self, device: &wgpu::Device, capacity: usize, coding: Coding) {
+        let [rows, count] = texture::sheets(capacity).map(|n| u32::try_from(n).unwrap_or(u32::MAX));
+        let count = count.min(device.limits().max_texture_array_layers);
+        let size = if capacity == 0 { [1, 1] } else { [ACROSS * SIDE, rows * SIDE] };
+        // The old ones go before the new ones come.
+        self.sheets.destroy();
+        self.sheets = sheets(device, coding, size, count);
         self.group = group(device, &self.layout, &self.nodes, &self.sheets, &self.sampler);
         (self.capacity, self.coding) = (capacity, coding);
         self.places.clear();
-        self.free = (0..count * IN_SHEET).rev().collect();
-        self.bytes = u64::from(count * IN_SHEET) * coding.tile_bytes() as u64;
+        let places = if capacity == 0 { 0 } else { count * rows * ACROSS };
+        self.free = (0..places).rev().collect();
+        self.bytes = u64::from(places) * coding.tile_bytes() as u64;
     }
 
     fn tell(&self, queue: &wgpu::Queue, nodes: &[Node]) {
@@ -255,10 +280,10 @@ pub(super) fn reads_blocks(device: &wgpu::Device) -> bool {
     device.features().contains(wgpu::Features::TEXTURE_COMPRESSION_BC)
 }
 
-fn sheets(device: &wgpu::Device, coding: Coding, side: u32, count: u32) -> wgpu::Texture {
+fn sheets(device: &wgpu::Device, coding: Coding, [width, height]: [u32; 2], count: u32) -> wgpu::Texture {
     device.create_texture(&wgpu::TextureDescriptor {
         label: Some("imagery"),
-        size: wgpu::Extent3d { width: side, height: side, depth_or_array_layers: count },
+        size: wgpu::Extent3d { width, height, depth_or_array_layers: count },
         mip_level_count: 1,
         sample_count: 1,
         dimension: wgpu::TextureDimension::D2,

@@ -122,7 +122,12 @@ impl FrameUniform {
             zenith,
             options: [flag(encode), flag(look.show_levels), flag(look.colours == Colours::Flat), flag(even)],
             water: [r, g, b, single(view.lowest())],
-            drape: [look.imagery.light, look.imagery.opacity, f32::from(anisotropy), 0.0],
+            drape: [
+                look.imagery.light,
+                look.imagery.opacity,
+                f32::from(anisotropy),
+                single(1.0 / view.pixels_per_radian()),
+            ],
             land: ramp::land(look.colours).map(|(at, srgb)| colour(srgb, at)),
             sea: ramp::sea().map(|(at, srgb)| colour(srgb, at)),
             style: [

@@ -12,6 +12,7 @@
 //! | `water` | what is mirrored in water and seen through it |
 //! | `overlay` | what egui draws over a picture: the panel, annotations |
 //! | `offscreen` | pictures without a window |
+//! | `room` | what all but diamonds and imagery takes of the GPU's memory |
 //!
 //! A diamond is one or two draws: its points at their own buffer, its place and axes as an instance, the
 //! index lists shared by all; irregular triangles have vertices and index lists of their own. One in motion has a second
@@ -28,6 +29,7 @@ mod overlay;
 mod pipelines;
 mod ramp;
 mod resident;
+mod room;
 mod view;
 mod water;
 
@@ -41,7 +43,7 @@ pub(crate) use overlay::Overlay;
 pub use ramp::{Quantity, Scale, water_colour};
 
 use crate::camera::{Bounds, Camera, nearest_drawn};
-use crate::drawing::{DrawItem, Mirror};
+use crate::drawing::{DrawItem, Mirror, left_for_diamonds};
 use crate::surface::Surface;
 use crate::texture::Drape;
 use diamantina_protocol::message::{self, Layer};
@@ -50,6 +52,7 @@ use frame::{FrameUniform, LayerUniform, Reference, single};
 use pipelines::{Kind, Mode, Pipelines, Target, sky_pipeline, terrain_pipelines};
 use ramp::encoded;
 use resident::{Residents, Triangles};
+use std::collections::BTreeSet;
 use std::ops::Range;
 use view::View;
 use water::WaterPasses;
@@ -69,9 +72,8 @@ pub struct Options {
     pub format: wgpu::TextureFormat,
     /// Samples a pixel: 1, or 4 to smooth edges.
     pub samples: u32,
-    /// Bytes of GPU memory for surfaces and their motions; those that a frame draws are kept whatever they take: that they
-    /// fit is the cut's business. Pictures between passes and what all diamonds share come on top:
-    /// see [`FrameStats::fixed_bytes`].
+    /// Bytes of GPU memory for all that frames take. Surfaces that were drawn a while ago are kept as long as there is room for them;
+    /// all else is there whatever it takes: that it fits is the business of who says what to draw.
     pub budget_bytes: u64,
     /// Steps that imagery seen at a slant is sampled in, 1 to 16: more is sharper.
     pub anisotropy: u16,
@@ -98,11 +100,19 @@ pub struct FrameStats {
     pub draws: u32,
     /// Bytes of surfaces uploaded for this frame.
     pub uploaded_bytes: u64,
-    /// Bytes of GPU memory that surfaces and their motions take: what the budget is about.
+    /// Bytes of GPU memory that surfaces and their motions take.
     pub gpu_bytes: u64,
-    /// Bytes of GPU memory that the picture's size, the water in view and the room for imagery alone decide upon: depth, samples, what is
-    /// mirrored and seen through, tiles, and the index lists that all diamonds share.
+    /// Bytes of GPU memory that all else takes: the picture, depth, samples, what is mirrored and seen through, tiles of imagery,
+    /// the index lists that all diamonds share, and where each of them is.
     pub fixed_bytes: u64,
+}
+
+impl FrameStats {
+    /// Bytes of GPU memory that are taken: what the budget is about.
+    #[must_use]
+    pub fn total_bytes(&self) -> u64 {
+        self.gpu_bytes + self.fixed_bytes
+    }
 }
 
 /// What helps where there is no adapter, and where there is no device.
@@ -203,6 +213,18 @@ struct Instance {
     /// The first tile of imagery, and where in it the eye is and what a metre is.
     tile: u32,
     drape: [f32; 4],
+    /// How large its triangles are in the mean, in metres: the side of a square of two.
+    triangle: f32,
+}
+
+/// What is drawn of items.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum What {
+    Triangles,
+    /// And the ring around those of water.
+    Ringed,
+    /// The lines around triangles.
+    Lines,
 }
 
 /// A draw: an item of the frame that is in view.
@@ -236,6 +258,9 @@ pub struct Renderer {
     lens: Option<Lens>,
     water: Option<WaterPasses>,
     attachments: Option<Attachments>,
+    /// What the caller takes, a pixel and besides.
+    target_bytes: u64,
+    beside_bytes: u64,
 }
 
 /// What a pass is told of where it draws from: uniforms, and the places of its diamonds.
@@ -280,7 +305,7 @@ impl Renderer {
         let target = Target { format: options.format, samples: options.samples };
         let drapes = Drapes::new(&device, options.anisotropy);
         Self {
-            residents: Residents::new(options.budget_bytes),
+            residents: Residents::new(),
             options: *options,
             filled: terrain_pipelines(
                 &device,
@@ -297,6 +322,8 @@ impl Renderer {
             groups,
             water: None,
             attachments: None,
+            target_bytes: 0,
+            beside_bytes: 0,
             device,
             queue,
         }
@@ -329,8 +356,12 @@ impl Renderer {
     ) -> FrameStats {
         let mirrors = if look.mirrors() { self.mirrors.as_slice() } else { &[] };
         let mirrored = mirrors.iter().flat_map(|mirror| &mirror.items);
+        let waters: BTreeSet<usize> =
+            items.iter().filter(|item| is_water(layers, item, look)).map(|item| item.layer).collect();
+        let taken = self.frame_bytes(layers, camera.size, look, waters.len()) + self.drapes.pictures_bytes();
+        let room = left_for_diamonds(self.options.budget_bytes, taken);
         let uploaded_bytes =
-            self.residents.start_frame(&self.device, layers, items, mirrored, look.wireframe);
+            self.residents.start_frame(&self.device, layers, items, mirrored, look.wireframe, room);
         let mut stats =
             FrameStats { uploaded_bytes, gpu_bytes: self.residents.bytes(), ..Default::default() };
         stats.uploaded_bytes += std::mem::take(&mut self.draped_bytes);
@@ -350,7 +381,8 @@ impl Renderer {
         let mut lens = self.lens.take().unwrap_or_else(|| Lens::new(&self.device, &self.groups));
         lens.write(self, layers, &view, look, &draws, !self.options.format.is_srgb());
         let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
-        let mut water = self.water.take();
+        // Pictures that are drawn no more take no room.
+        let mut water = self.water.take().filter(|_| look.mirrors());
         if !surfaces.is_empty() {
             water.get_or_insert_with(|| WaterPasses::new(self, camera.size)).prepare(
                 self,
@@ -367,11 +399,13 @@ impl Renderer {
             let mut pass = begin_pass(&mut encoder, &attachments, target, look, self.options.format);
             pass.set_bind_group(2, self.drapes.group(), &[]);
             match self.wires.as_ref().filter(|_| look.wireframe) {
-                None => self.draw_surfaces(&mut pass, &lens, land, 0, &self.filled, false, &mut stats),
+                None => {
+                    self.draw_surfaces(&mut pass, &lens, land, 0, &self.filled, What::Triangles, &mut stats)
+                }
                 Some([behind, lines]) => {
-                    self.draw_surfaces(&mut pass, &lens, land, 0, behind, false, &mut stats);
+                    self.draw_surfaces(&mut pass, &lens, land, 0, behind, What::Triangles, &mut stats);
                     let mut uncounted = FrameStats::default();
-                    self.draw_surfaces(&mut pass, &lens, land, 0, lines, true, &mut uncounted);
+                    self.draw_surfaces(&mut pass, &lens, land, 0, lines, What::Lines, &mut uncounted);
                 }
             }
             if let Some(water) = &water {
@@ -383,7 +417,10 @@ impl Renderer {
         stats.fixed_bytes = self.drapes.bytes()
             + self.residents.shared_bytes()
             + attachments.bytes(&self.options)
-            + water.as_ref().map_or(0, WaterPasses::bytes);
+            + water.as_ref().map_or(0, |water| water.bytes() + water.lens_bytes())
+            + lens.bytes()
+            + room::pixels(camera.size) * self.target_bytes
+            + self.beside_bytes;
         (self.lens, self.water, self.attachments) = (Some(lens), water, Some(attachments));
         self.queue.submit([encoder.finish()]);
         stats
@@ -457,7 +494,7 @@ impl Renderer {
         draws
     }
 
-    /// Draws the triangles of the items, or the lines around them.
+    /// Draws the triangles of the items, with the ring around them or without, or the lines around each of them.
     ///
     /// The draws are those that `lens` was told of, from the one with this number on.
     #[allow(clippy::too_many_arguments, reason = "a pass is told by so many things, each of its own type")]
@@ -468,7 +505,7 @@ impl Renderer {
         draws: &[Draw<'_>],
         first_instance: u32,
         pipelines: &Pipelines,
-        lines: bool,
+        what: What,
         stats: &mut FrameStats,
     ) {
         let (Some((_, layer_group)), Some(instances)) = (&lens.layers, &lens.instances) else { return };
@@ -498,7 +535,7 @@ impl Renderer {
             }
             if !triangles_now.is_some_and(|now| std::ptr::eq(now, triangles)) {
                 triangles_now = Some(triangles);
-                let indices = if lines { triangles.lines.as_ref() } else { None };
+                let indices = if what == What::Lines { triangles.lines.as_ref() } else { None };
                 pass.set_index_buffer(
                     indices.unwrap_or(&triangles.indices).slice(..),
                     wgpu::IndexFormat::Uint16,
@@ -508,15 +545,34 @@ impl Renderer {
             if let Some(motion) = &resident.motion {
                 pass.set_vertex_buffer(3, motion.records.slice(..));
             }
-            for range in runs(&triangles.sides, draw.sides) {
+            let ring = runs(&triangles.ring, if what == What::Ringed { draw.sides } else { 0 });
+            for range in runs(&triangles.sides, draw.sides).chain(ring) {
                 stats.draws += 1;
                 stats.triangles += u64::from((range.end - range.start) / 3);
                 // Each index of a triangle begins a line of two.
-                let range = if lines { 2 * range.start..2 * range.end } else { range };
+                let range = if what == What::Lines { 2 * range.start..2 * range.end } else { range };
                 pass.draw_indexed(range, 0, instance..instance + 1);
             }
         }
     }
+}
+
+/// The side of a square of two triangles of an item, as large as they are in the mean, in metres.
+fn triangle_metres(layer: &Layer, item: &DrawItem) -> f64 {
+    let local = layer.forest.local(item.diamond);
+    let metres = |[x, y]: [i64; 2]| [x as f64 * layer.cell[0], y as f64 * layer.cell[1]];
+    let ([a, b], [c, d]) = (metres(local.u), metres(local.v));
+    let cell = (a * d - b * c).abs();
+    let squares = match &*item.surface {
+        Surface::Points(points) if points.block().has_centres() => 2.0,
+        Surface::Points(_) => 1.0,
+        Surface::Tin(tin) => {
+            // Half of a diamond lies beyond the forest's rim, if it is not upper.
+            let cells = layer.forest.segments_at(item.diamond.level()).pow(2) as f64;
+            tin.triangles() as f64 / if local.upper { 2.0 } else { 1.0 } / cells
+        }
+    };
+    (cell / squares.max(1e-9)).sqrt()
 }
 
 /// Whether an item is drawn as water, by passes of its own.
@@ -539,6 +595,12 @@ impl Lens {
             entries: &[wgpu::BindGroupEntry { binding: 0, resource: frame.as_entire_binding() }],
         });
         Self { frame, frame_group, layers: None, instances: None }
+    }
+
+    /// Bytes of GPU memory that it takes.
+    fn bytes(&self) -> u64 {
+        let layers = self.layers.as_ref().map_or(0, |(buffer, _)| buffer.size());
+        self.frame.size() + layers + self.instances.as_ref().map_or(0, wgpu::Buffer::size)
     }
 
     /// Tells it all of a pass; the distance of the near plane, in metres. `encode`: see [`FrameUniform::new`].
@@ -603,6 +665,7 @@ impl Lens {
                     duration,
                     tile: start.node,
                     drape: start.place,
+                    triangle: single(triangle_metres(&layers[layer], draw.item)),
                 }
             })
             .collect();

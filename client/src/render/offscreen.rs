@@ -11,6 +11,9 @@ use egui::{Context, Painter, Pos2, RawInput, Rect, Vec2, ViewportId};
 /// The target's format where what is drawn over the picture mixes colours: the same bytes, as they are.
 const PLAIN: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
 
+/// Bytes a pixel that a picture takes: its target, and what it comes back by, but for the ends of its rows.
+const TARGET_BYTES: u64 = 8;
+
 /// A renderer with a target of its own, as large as the last picture.
 pub struct Offscreen {
     renderer: Renderer,
@@ -29,7 +32,9 @@ impl Offscreen {
         let found = async { device(&instance(BACKENDS).await, None, "offscreen").await };
         let (adapter, device, queue) = pollster::block_on(found)?;
         let options = Options { format: wgpu::TextureFormat::Rgba8UnormSrgb, ..fit(options, &adapter) };
-        Ok(Self { renderer: Renderer::new(device, queue, &options), target: None, overlay: None })
+        let mut renderer = Renderer::new(device, queue, &options);
+        renderer.count_targets(TARGET_BYTES, 0);
+        Ok(Self { renderer, target: None, overlay: None })
     }
 
     /// See [`Renderer::drape`].
@@ -46,6 +51,17 @@ impl Offscreen {
     #[must_use]
     pub fn reads_blocks(&self) -> bool {
         self.renderer.reads_blocks()
+    }
+
+    #[cfg(test)]
+    pub(super) fn device(&self) -> &wgpu::Device {
+        self.renderer.device()
+    }
+
+    /// See [`Renderer::frame_bytes`].
+    #[must_use]
+    pub fn frame_bytes(&self, layers: &[Layer], size: [u32; 2], look: &Look, waters: usize) -> u64 {
+        self.renderer.frame_bytes(layers, size, look, waters)
     }
 
     /// Draws a frame of `camera.size` pixels. See [`Renderer::draw`].

@@ -1,12 +1,15 @@
 //! What egui draws over a picture: the viewer's panel, and annotations.
 
-use egui::{Context, FullOutput};
+use egui::{Context, FullOutput, TextureId};
 use egui_wgpu::{RendererOptions, ScreenDescriptor};
+use std::collections::HashMap;
 
 /// Draws what an egui context has to show. Its colours are mixed as they are encoded, so its targets are views of a format
 /// that stores them as they are.
 pub(crate) struct Overlay {
     painter: egui_wgpu::Renderer,
+    /// Bytes that each of its textures takes.
+    textures: HashMap<TextureId, u64>,
 }
 
 /// What to draw, and when.
@@ -15,14 +18,19 @@ pub(crate) struct Shapes {
     triangles: Vec<egui::ClippedPrimitive>,
     pixels_per_point: f32,
     /// Textures that are not needed after it.
-    free: Vec<egui::TextureId>,
+    free: Vec<TextureId>,
 }
 
 impl Overlay {
     /// What draws to views of a format. `exact`: without dithering, so that a colour is that of each of its pixels.
     pub(crate) fn new(device: &wgpu::Device, format: wgpu::TextureFormat, exact: bool) -> Self {
         let options = if exact { RendererOptions::PREDICTABLE } else { RendererOptions::default() };
-        Self { painter: egui_wgpu::Renderer::new(device, format, options) }
+        Self { painter: egui_wgpu::Renderer::new(device, format, options), textures: HashMap::new() }
+    }
+
+    /// Bytes of GPU memory that letters and other textures take.
+    pub(crate) fn bytes(&self) -> u64 {
+        self.textures.values().sum()
     }
 
     /// Takes in what a frame of the context gave: each frame, drawn or not, or textures are lost.
@@ -37,6 +45,10 @@ impl Overlay {
         let triangles = context.tessellate(std::mem::take(&mut output.shapes), pixels_per_point);
         for (id, changes) in output.textures_delta.set.drain() {
             for change in &changes {
+                if change.pos.is_none() {
+                    let [width, height] = change.image.size();
+                    self.textures.insert(id, 4 * (width * height) as u64);
+                }
                 self.painter.update_texture(device, queue, id, change);
             }
         }
@@ -75,6 +87,7 @@ impl Overlay {
     /// Frees what was needed for these shapes alone.
     pub(crate) fn end(&mut self, shapes: Shapes) {
         for id in shapes.free {
+            self.textures.remove(&id);
             self.painter.free_texture(&id);
         }
     }

@@ -70,7 +70,7 @@ pub(super) type Pipelines = [wgpu::RenderPipeline; 4];
 const PLACE: &[wgpu::VertexAttribute] = &wgpu::vertex_attr_array![0 => Uint16x2];
 const POINT: &[wgpu::VertexAttribute] = &wgpu::vertex_attr_array![1 => Sint32, 2 => Snorm16x2];
 const INSTANCE: &[wgpu::VertexAttribute] =
-    &wgpu::vertex_attr_array![3 => Sint32x2, 4 => Sint32x4, 5 => Sint32x4, 10 => Float32x4];
+    &wgpu::vertex_attr_array![3 => Sint32x2, 4 => Sint32x4, 5 => Sint32x4, 10 => Float32x4, 11 => Float32];
 pub(super) const RECORD: &[wgpu::VertexAttribute] =
     &wgpu::vertex_attr_array![6 => Float32x2, 7 => Snorm16x2, 8 => Snorm16x2, 9 => Sint32];
 
@@ -118,7 +118,8 @@ pub(super) fn terrain_pipelines(
         // Where a shader leaves out pixels, the GPU cannot tell beforehand which ones are hidden: so only where need be.
         let constants = [("IN_SOME_PIXELS", 1.0)];
         let constants = if kind == Kind::FadingCorners { &constants[..] } else { &[] };
-        stage.pipeline(device, target, [vertex, fragment], constants, buffers, depth, topology)
+        let blend = (mode == Mode::Lines).then_some(wgpu::BlendState::ALPHA_BLENDING);
+        stage.pipeline(device, target, [vertex, fragment], constants, buffers, depth, topology, blend)
     };
     [
         made(Kind::Points, "terrain_vertex", &points[..3]),
@@ -146,7 +147,7 @@ pub(super) fn sky_pipeline(
     let entries = ["sky_vertex", "sky_fragment"];
     let depth = Depth { compare: wgpu::CompareFunction::GreaterEqual, write: false, behind: false };
     let topology = wgpu::PrimitiveTopology::TriangleList;
-    Stage::new(device, SKY_WGSL, &[frame]).pipeline(device, target, entries, &[], &[], depth, topology)
+    Stage::new(device, SKY_WGSL, &[frame]).pipeline(device, target, entries, &[], &[], depth, topology, None)
 }
 
 /// What pipelines of the same shaders share: they are read and checked once.
@@ -184,6 +185,7 @@ impl Stage {
         buffers: &[Option<wgpu::VertexBufferLayout<'_>>],
         depth: Depth,
         topology: wgpu::PrimitiveTopology,
+        blend: Option<wgpu::BlendState>,
     ) -> wgpu::RenderPipeline {
         device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
             label: Some(vertex),
@@ -214,7 +216,7 @@ impl Stage {
                 compilation_options: wgpu::PipelineCompilationOptions { constants, ..Default::default() },
                 targets: &[Some(wgpu::ColorTargetState {
                     format: target.format,
-                    blend: None,
+                    blend,
                     write_mask: wgpu::ColorWrites::ALL,
                 })],
             }),

@@ -8,11 +8,12 @@
 use crate::camera::Bounds;
 use crate::drawing::DrawItem;
 use crate::morph::Motion;
+use crate::surface::rim::{Rim, rim};
 use crate::surface::triangles::{self, Form, Lists};
 use crate::surface::{Points, Surface, Tin};
 use diamantina_protocol::NODATA;
 use diamantina_protocol::diamond::Diamond;
-use diamantina_protocol::message::Layer;
+use diamantina_protocol::message::{Kind, Layer};
 use glam::DVec3;
 use std::collections::HashMap;
 use std::ops::Range;
@@ -41,6 +42,8 @@ pub(super) struct Triangles {
     pub(super) indices: wgpu::Buffer,
     /// Where each side's list lies.
     pub(super) sides: [Range<u32>; 4],
+    /// Where the lists of the ring around them lie, of water.
+    pub(super) ring: [Range<u32>; 4],
     /// The lines around the triangles, if they are wanted: for each index two, from its vertex to the next one's.
     pub(super) lines: Option<wgpu::Buffer>,
 }
@@ -74,7 +77,6 @@ type Key = (usize, Diamond);
 
 /// All surfaces on the GPU.
 pub(super) struct Residents {
-    budget_bytes: u64,
     bytes: u64,
     frame: u64,
     by_key: HashMap<Key, Resident>,
@@ -82,8 +84,8 @@ pub(super) struct Residents {
 }
 
 impl Residents {
-    pub(super) fn new(budget_bytes: u64) -> Self {
-        Self { budget_bytes, bytes: 0, frame: 0, by_key: HashMap::new(), by_form: HashMap::new() }
+    pub(super) fn new() -> Self {
+        Self { bytes: 0, frame: 0, by_key: HashMap::new(), by_form: HashMap::new() }
     }
 
     /// Bytes of GPU memory that surfaces take.
@@ -105,8 +107,8 @@ impl Residents {
         self.by_form.get(&Form::of(item.surface.points()?.block()))
     }
 
-    /// Starts a frame that draws these items, and these at rest in mirrors: uploads those that are not there yet, and drops others if
-    /// they exceed the budget. Returns the bytes uploaded. Items of unknown layers are passed over.
+    /// Starts a frame that draws these items, and these at rest in mirrors: uploads those that are not there yet, and drops others
+    /// where all would take more than `room_bytes`. Returns the bytes uploaded. Items of unknown layers are passed over.
     pub(super) fn start_frame<'a>(
         &mut self,
         device: &wgpu::Device,
@@ -114,17 +116,23 @@ impl Residents {
         items: &'a [DrawItem],
         mirrored: impl Iterator<Item = &'a DrawItem> + Clone,
         wires: bool,
+        room_bytes: u64,
     ) -> u64 {
         self.frame += 1;
         let mut coming_bytes = 0;
         let all = items.iter().map(|item| (item, true)).chain(mirrored.map(|item| (item, false)));
-        for (item, _) in all.clone() {
+        for (item, moves) in all.clone() {
             match self.by_key.get_mut(&(item.layer, item.diamond)) {
-                Some(resident) => resident.last_frame = self.frame,
+                Some(resident) => {
+                    resident.last_frame = self.frame;
+                    if moves && !resident.moves_as(item) {
+                        coming_bytes += item.motion_bytes();
+                    }
+                }
                 None => coming_bytes += item.gpu_bytes(wires),
             }
         }
-        self.shrink(self.budget_bytes.saturating_sub(coming_bytes));
+        self.shrink(room_bytes.saturating_sub(coming_bytes));
         let mut uploaded_bytes = 0;
         for (item, moves) in all {
             let Some(layer) = layers.get(item.layer) else { continue };
@@ -160,7 +168,7 @@ impl Residents {
                 self.bytes -= old.bytes;
             }
         }
-        self.shrink(self.budget_bytes);
+        self.shrink(room_bytes);
         uploaded_bytes
     }
 
@@ -213,7 +221,15 @@ impl Triangles {
             contents: bytemuck::cast_slice(&indices),
             usage: wgpu::BufferUsages::INDEX,
         });
-        Self { indices, sides: lists.sides, lines }
+        Self { indices, sides: lists.sides, ring: [const { 0..0 }; 4], lines }
+    }
+
+    /// Those of water, and of the ring around it.
+    fn ringed(device: &wgpu::Device, mut lists: Lists, ring: Lists, wires: bool) -> Self {
+        let first = u32::try_from(lists.indices.len()).unwrap_or(0);
+        lists.indices.extend(ring.indices);
+        let ring = ring.sides.map(|side| first + side.start..first + side.end);
+        Self { ring, ..Self::new(device, lists, wires) }
     }
 
     /// Bytes of GPU memory that they take.
@@ -225,6 +241,9 @@ impl Triangles {
 impl Resident {
     fn upload(device: &wgpu::Device, layer: &Layer, item: &DrawItem, frame: u64, wires: bool) -> Self {
         let (points, own, range) = match &*item.surface {
+            Surface::Points(points) if layer.kind == Kind::Water && points.has_nodata() => {
+                upload_water(device, layer, item.diamond, points, wires)
+            }
             Surface::Points(points) => upload_points(device, points, wires),
             Surface::Tin(tin) => upload_tin(device, tin, wires),
         };
@@ -236,13 +255,18 @@ impl Resident {
         Self { surface, points, own, motion: None, bounds, bytes, last_frame: frame }
     }
 
+    /// Whether it has the motion of the item and no other.
+    fn moves_as(&self, item: &DrawItem) -> bool {
+        let wanted = item.moving.as_ref().map(|moving| Arc::as_ptr(&moving.motion));
+        self.motion.as_ref().map(|buffer| buffer.motion.as_ptr()) == wanted
+    }
+
     /// Has the motion of the item and no other. Returns the bytes uploaded.
     fn move_as(&mut self, device: &wgpu::Device, item: &DrawItem) -> u64 {
-        let wanted = item.moving.as_ref().map(|moving| &moving.motion);
-        let here = self.motion.as_ref().map(|buffer| buffer.motion.as_ptr());
-        if here == wanted.map(Arc::as_ptr) {
+        if self.moves_as(item) {
             return 0;
         }
+        let wanted = item.moving.as_ref().map(|moving| &moving.motion);
         self.bytes -= self.motion.take().map_or(0, |old| old.records.size());
         let slots = item.surface.points().map(|points| points.normals().len());
         let Some(motion) = wanted.filter(|m| slots == Some(m.records().len())) else {
@@ -282,6 +306,29 @@ fn upload_points(device: &wgpu::Device, points: &Points, wires: bool) -> Uploade
     let own = points.has_nodata().then(|| Triangles::new(device, triangles::lists_of(points.block()), wires));
     let range = range(heights.iter().copied().filter(|h| *h != NODATA));
     (vertices(device, bytemuck::cast_slice(&all)), own, range)
+}
+
+/// Water that is not everywhere: it has a ring around it that runs on under the ground, as far as there are samples.
+fn upload_water(
+    device: &wgpu::Device,
+    layer: &Layer,
+    diamond: Diamond,
+    points: &Points,
+    wires: bool,
+) -> Uploaded {
+    let (block, local) = (points.block(), layer.forest.local(diamond));
+    let is_within = |[p, q]: [u16; 2]| {
+        (0..2).all(|i| {
+            let at = local.origin[i] + (local.u[i] * i64::from(p) + local.v[i] * i64::from(q)) / 2;
+            (0..i64::from(layer.samples[i])).contains(&at)
+        })
+    };
+    let Rim { heights, lists } = rim(block, is_within);
+    let all: Vec<SurfacePoint> =
+        heights.iter().zip(points.normals()).map(|(h, normal)| point(*h, *normal)).collect();
+    let own = Triangles::ringed(device, triangles::lists_of(block), lists, wires);
+    let range = range(heights.iter().copied().filter(|h| *h != NODATA));
+    (vertices(device, bytemuck::cast_slice(&all)), Some(own), range)
 }
 
 fn upload_tin(device: &wgpu::Device, tin: &Tin, wires: bool) -> Uploaded {

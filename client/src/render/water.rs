@@ -11,8 +11,9 @@
 
 use super::frame::single;
 use super::pipelines::{Mode, Pipelines, Target, sky_pipeline, terrain_pipelines};
+use super::room::pixels;
 use super::view::View;
-use super::{DEPTH, Draw, FrameStats, Lens, Look, Renderer, clear_colour, is_water};
+use super::{DEPTH, Draw, FrameStats, Lens, Look, Renderer, What, clear_colour, is_water};
 use crate::camera::Camera;
 use crate::drawing::DrawItem;
 use crate::mirror::mean_height;
@@ -132,11 +133,22 @@ impl Sheet {
         }
     }
 
-    /// Bytes of GPU memory: four a pixel of colour, and of each sample four of depth and, where there are several, of colour.
     fn bytes(&self) -> u64 {
-        let of_samples = u64::from(self.samples) * if self.sampled.is_some() { 8 } else { 4 };
-        self.size.map(u64::from).iter().product::<u64>() * (4 + of_samples)
+        sheet_bytes(self.size, self.samples)
     }
+}
+
+/// Bytes of GPU memory: four a pixel of colour, and of each sample four of depth and, where there are several, of colour.
+fn sheet_bytes(size: [u32; 2], samples: u32) -> u64 {
+    let of_samples = u64::from(samples) * if samples > 1 { 8 } else { 4 };
+    pixels(size) * (4 + of_samples)
+}
+
+/// The size of what is mirrored in pictures of a size.
+fn mirrored_size(size: [u32; 2], look: &Look) -> [u32; 2] {
+    let scale = look.water.mirror_scale.clamp(1e-3, 1.0);
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "at most as large as it was")]
+    size.map(|pixels| ((f64::from(pixels) * scale).round() as u32).max(1))
 }
 
 /// What a layer of water mirrors.
@@ -198,8 +210,8 @@ fn scenery(renderer: &Renderer, mode: Mode, samples: u32) -> Scenery {
 
 /// Samples a pixel of what is mirrored. Outlines in still water are seen as those of the picture are; waves make them soft by
 /// themselves, and four samples take a software renderer a quarter to a half longer.
-fn mirror_samples(renderer: &Renderer, look: &Look) -> u32 {
-    if look.water.waves > 0.0 { 1 } else { renderer.options.samples }
+fn mirror_samples(samples: u32, look: &Look) -> u32 {
+    if look.water.waves > 0.0 { 1 } else { samples }
 }
 
 /// All that water takes, made when it is first seen.
@@ -289,6 +301,21 @@ impl WaterPasses {
         sheets.map(Sheet::bytes).sum()
     }
 
+    /// Bytes of GPU memory that its pictures take in pictures of a size and of so many samples a pixel, with so many layers of water.
+    pub(super) fn bytes_of(size: [u32; 2], look: &Look, samples: u32, waters: usize) -> u64 {
+        if waters == 0 {
+            return 0;
+        }
+        let mirror = sheet_bytes(mirrored_size(size, look), mirror_samples(samples, look));
+        sheet_bytes(size, 1) + waters as u64 * mirror
+    }
+
+    /// Bytes of GPU memory that what is told of its passes takes.
+    pub(super) fn lens_bytes(&self) -> u64 {
+        let of_mirror = |mirror: &Mirror| mirror.uniform.size() + mirror.lens.bytes();
+        self.scene_lens.bytes() + self.mirrors.values().map(of_mirror).sum::<u64>()
+    }
+
     /// Draws what the layers of water in view mirror, and what is seen through them. `water` is sorted by layer.
     #[allow(clippy::too_many_arguments, reason = "a frame is told by so many things, each of its own type")]
     pub(super) fn prepare(
@@ -315,13 +342,7 @@ impl WaterPasses {
         let near = self.scene_lens.write(renderer, layers, &view, &clear, &land, false);
         draw_sheet(renderer, encoder, &self.scene, &self.scene_lens, look, &land, &self.through, stats);
 
-        let scale = look.water.mirror_scale.clamp(1e-3, 1.0);
-        #[allow(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            reason = "at most as large as it was"
-        )]
-        let size = camera.size.map(|pixels| ((f64::from(pixels) * scale).round() as u32).max(1));
+        let size = mirrored_size(camera.size, look);
         let mut of_layer: BTreeMap<usize, Vec<&Draw<'_>>> = BTreeMap::new();
         for draw in water {
             of_layer.entry(draw.item.layer).or_default().push(draw);
@@ -335,7 +356,9 @@ impl WaterPasses {
                 self.mirrors.insert(number, mirror);
             }
         }
-        let samples = mirror_samples(renderer, look);
+        // Their pictures would be more than those of the layers that are shown.
+        self.mirrors.retain(|number, _| of_layer.contains_key(number));
+        let samples = mirror_samples(renderer.options.samples, look);
         let mirrored =
             self.mirrored.entry(samples).or_insert_with(|| scenery(renderer, Mode::Mirrored, samples));
         for (number, draws) in of_layer {
@@ -380,7 +403,7 @@ impl WaterPasses {
         for draws in water.chunk_by(|a, b| a.item.layer == b.item.layer) {
             if let Some(mirror) = draws.first().and_then(|draw| self.mirrors.get(&draw.item.layer)) {
                 pass.set_bind_group(2, &mirror.group, &[]);
-                renderer.draw_surfaces(pass, lens, draws, first, &self.surfaces, false, stats);
+                renderer.draw_surfaces(pass, lens, draws, first, &self.surfaces, What::Ringed, stats);
             }
             first += u32::try_from(draws.len()).unwrap_or(0);
         }
@@ -418,6 +441,6 @@ fn draw_sheet(
         ..Default::default()
     });
     pass.set_bind_group(2, renderer.drapes.group(), &[]);
-    renderer.draw_surfaces(&mut pass, lens, land, 0, pipelines, false, stats);
+    renderer.draw_surfaces(&mut pass, lens, land, 0, pipelines, What::Triangles, stats);
     lens.draw_sky(&mut pass, sky, look);
 }

@@ -4,6 +4,7 @@
 //! surfaces that meet along a side agree about its normals too, and light shows no seams.
 
 mod points;
+pub(crate) mod rim;
 mod shade;
 mod tin;
 pub(crate) mod triangles;

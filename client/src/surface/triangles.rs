@@ -16,6 +16,7 @@
 //! bintree's do, and each list has n^2 / 2.
 
 use diamantina_protocol::NODATA;
+use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::diamond::Block;
 use std::ops::Range;
 
@@ -38,6 +39,19 @@ pub(crate) struct Form {
 impl Form {
     pub(crate) fn of(block: &Block) -> Self {
         Self { segments: block.segments(), centres: block.has_centres() }
+    }
+
+    /// Of the diamonds of a level.
+    pub(crate) fn at(forest: &Forest, level: u32) -> Self {
+        Self { segments: forest.segments_at(level), centres: forest.adds_points(level) || level % 2 == 1 }
+    }
+
+    /// Bytes of GPU memory that places and index lists take; with `wires` also the lines around triangles.
+    pub(crate) fn gpu_bytes(self, wires: bool) -> u64 {
+        let cells = self.segments.pow(2);
+        let (slots, indices) = if self.centres { (cells, 12 * cells) } else { (0, 6 * cells) };
+        let slots = (self.segments + 1).pow(2) + slots;
+        (4 * slots + 2 * indices.next_multiple_of(2) + if wires { 4 * indices } else { 0 }) as u64
     }
 }
 
@@ -72,13 +86,20 @@ pub(crate) fn lists(form: Form, keep: impl Fn(usize) -> bool) -> Lists {
             }
         }
     }
-    let mut end = 0;
-    let sides = parts.each_ref().map(|part| {
-        let start = end;
-        end += u32::try_from(part.len()).unwrap_or(0);
-        start..end
-    });
-    Lists { indices: parts.concat(), sides }
+    Lists::of(&parts)
+}
+
+impl Lists {
+    /// Those of the four sides.
+    pub(crate) fn of(parts: &[Vec<u16>; 4]) -> Self {
+        let mut end = 0;
+        let sides = parts.each_ref().map(|part| {
+            let start = end;
+            end += u32::try_from(part.len()).unwrap_or(0);
+            start..end
+        });
+        Self { indices: parts.concat(), sides }
+    }
 }
 
 /// The lists of a diamond with nodata: triangles with a point that has no height are dropped.

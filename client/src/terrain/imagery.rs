@@ -81,6 +81,7 @@ impl Terrain {
                 Err(error) => self.problem = Some(TerrainError::Thread(error).to_string()),
             }
         }
+        self.share_out();
     }
 
     pub(super) fn drape(&self, number: usize) -> std::io::Result<Draping> {

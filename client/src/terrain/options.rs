@@ -18,8 +18,11 @@ pub struct Options {
     /// Memory for surfaces and what is on its way to become one, in bytes. What the cut wants takes at most three quarters
     /// of it: where that is too little for the tolerance, the largest errors are reduced first.
     pub memory_bytes: usize,
-    /// GPU memory for the surfaces that are drawn and for their motions, in bytes. Where it is too little for the tolerance, the
-    /// largest errors are reduced first; where it is too little for motions, points jump.
+    /// GPU memory for all that is drawn, in bytes: first what frames need in any case, which [`Terrain::set_gpu_taken`] tells, then
+    /// imagery, then surfaces and their motions. Where it is too little for the tolerance, the largest errors are reduced first;
+    /// where it is too little for motions, points jump.
+    ///
+    /// [`Terrain::set_gpu_taken`]: super::Terrain::set_gpu_taken
     pub gpu_bytes: u64,
     /// Seconds that points take to move, and triangles to appear, from one cut to the next, at most [`morph::SECONDS_MAX`]; 0: they jump.
     pub morph_seconds: f64,
@@ -31,7 +34,7 @@ pub struct Options {
     pub zone: Option<String>,
     /// What lies on the terrain.
     pub imagery: Imagery,
-    /// Memory for tiles of imagery, in bytes; as much again on the GPU.
+    /// Memory for tiles of imagery, in bytes; as much again on the GPU, if that is no more than a third of what frames leave there.
     pub texture_bytes: usize,
     /// How their texels are coded.
     pub texture_coding: Coding,

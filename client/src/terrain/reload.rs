@@ -108,6 +108,7 @@ impl Terrain {
             next.options.tolerance_pixels = self.options.tolerance_pixels;
             next.options.exaggeration = self.options.exaggeration;
             next.wires = self.wires;
+            next.set_gpu_taken(self.gpu_taken);
             next.show_only(self.options.layers.clone());
             next.set_time(self.time(), self.steps.course);
             let view = next.draw_at(camera, seconds);

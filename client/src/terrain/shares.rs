@@ -8,12 +8,22 @@
 //! | decoded surfaces that wait for a frame | 1/32 | 256, 25 MB for n = 64 |
 //! | pages of the index beyond those in use | 1/32 | [`PAGES_MAX`] a layer |
 //! | motions | 1/16 | [`MOTIONS_MAX`] a layer |
+//!
+//! And how the GPU's is:
+//!
+//! | what | of the memory | at most |
+//! |---|---|---|
+//! | pictures that frames are made of, index lists that all diamonds share | as they need | |
+//! | imagery, where there is any | 1/3 of the rest | what tiles may take of the memory; at least [`TILES_MIN`] |
+//! | surfaces and their motions | what is left, but for 1/64 | |
 
 use super::LayerState;
 use super::steps::Steps;
 use crate::cache::PAGES_MAX;
-use crate::morph::{MOTIONS_MAX, Record};
+use crate::morph::{MOTIONS_MAX, Record, STARTS_MAX};
 use crate::surface::Points;
+#[cfg(doc)]
+use crate::texture::TILES_MIN;
 use diamantina_protocol::bintree::Forest;
 
 /// Bytes of payloads that are wished for or wait for their parents, however much memory there is.
@@ -31,8 +41,16 @@ const PAGE_BYTES: usize = 40_000;
 /// The least number of pages beyond those in use.
 const PAGES_MIN: usize = 16;
 
+/// Of what frames leave of the GPU's memory, the part that imagery may take.
+const IMAGERY_PART: u64 = 3;
+
 /// The least number of motions.
 const MOTIONS_MIN: usize = 16;
+
+/// What imagery may take of the GPU's memory, where frames need so much of it.
+pub(super) fn of_imagery(gpu_bytes: u64, taken: u64) -> u64 {
+    gpu_bytes.saturating_sub(taken) / IMAGERY_PART
+}
 
 /// The shares of a scene's memory.
 #[derive(Debug, Clone, Copy)]
@@ -77,6 +95,7 @@ impl Shares {
             state.gpu_bytes = gpu_bytes / shown as u64;
             state.pages_max = (self.pages / shown).clamp(PAGES_MIN, PAGES_MAX);
             state.morphs.set_motions_max((self.motions / shown).clamp(MOTIONS_MIN, MOTIONS_MAX));
+            state.morphs.set_starts_max(STARTS_MAX / shown);
         }
     }
 }

@@ -3,9 +3,13 @@
 //! One that is hidden keeps its index, and what is resident of it until the room is needed; no more of it is asked for.
 //! The steps of a series are shown together, by its name.
 
-use super::{Layer, Scene, Terrain};
+use super::{Layer, Scene, Terrain, shares};
 use crate::cut::Ideal;
+use crate::drawing::left_for_diamonds;
 use crate::morph::Morphs;
+use crate::texture::{Draping, TILES_MIN};
+use diamantina_protocol::message::Kind;
+use std::collections::HashSet;
 
 impl Terrain {
     /// Whether a layer, by its position in the scene, is streamed and drawn.
@@ -53,9 +57,56 @@ impl Terrain {
         self.options.layers = names;
     }
 
-    /// Gives each layer its share of the memory.
+    /// Gives imagery and each layer their shares of the memory.
     pub(super) fn share_out(&mut self) {
-        self.shares.share_out(&mut self.layers, &self.steps, self.options.gpu_bytes);
+        let budget = self.options.gpu_bytes;
+        if let Some(draping) = &mut self.draping {
+            draping.fit_gpu(shares::of_imagery(budget, self.gpu_taken));
+        }
+        let left = left_for_diamonds(budget, self.gpu_taken.saturating_add(self.imagery_gpu_bytes()));
+        self.shares.share_out(&mut self.layers, &self.steps, left);
+    }
+
+    /// Says how much of the GPU's memory frames take besides imagery and diamonds, from the next one on: it is taken off
+    /// [`Options::gpu_bytes`](super::Options::gpu_bytes) first.
+    pub fn set_gpu_taken(&mut self, bytes: u64) {
+        if bytes != self.gpu_taken {
+            self.gpu_taken = bytes;
+            self.share_out();
+        }
+    }
+
+    /// The least of the GPU's memory that frames can do with, besides the coarsest diamonds: what they take, and with imagery
+    /// the fewest tiles.
+    #[must_use]
+    pub fn gpu_least(&self) -> u64 {
+        let least = |_| crate::texture::gpu_bytes(TILES_MIN, self.options.texture_coding);
+        self.gpu_taken + self.draping.as_ref().map_or(0, least)
+    }
+
+    /// The GPU's memory that all that is drawn may take.
+    #[must_use]
+    pub fn gpu_budget(&self) -> u64 {
+        self.options.gpu_bytes
+    }
+
+    /// Layers of water that frames may draw at once: of a series one.
+    #[must_use]
+    pub fn waters(&self) -> usize {
+        let names: HashSet<&str> = self
+            .scene
+            .layers
+            .iter()
+            .zip(&self.layers)
+            .filter(|(layer, state)| state.shown && layer.kind == Kind::Water)
+            .map(|(layer, _)| self.scene.chosen_as(&layer.name))
+            .collect();
+        names.len()
+    }
+
+    /// What the pictures of tiles take of the GPU's memory, once the first is shown.
+    pub(super) fn imagery_gpu_bytes(&self) -> u64 {
+        self.draping.as_ref().map_or(0, Draping::gpu_bytes)
     }
 
     /// The scene with no layers but those that are shown; with all, where none is. For its extent: positions of layers are

@@ -64,10 +64,40 @@ pub struct Drape {
     pub coding: Coding,
 }
 
+/// Pictures of tiles in a row of what holds them on the GPU.
+pub const ROW: usize = 8;
+
+/// Rows of them in a sheet: 2048 texels, which any GPU can have.
+pub const SHEET_ROWS: usize = 8;
+
+/// The fewest tiles that are worth showing, and the least that imagery takes: two rows.
+pub const TILES_MIN: usize = 2 * ROW;
+
 /// How many tiles fit into so many bytes.
 #[must_use]
 pub fn capacity(bytes: usize, coding: Coding) -> usize {
-    (bytes / coding.tile_bytes()).clamp(16, choose::TILES_MAX)
+    (bytes / coding.tile_bytes()).clamp(TILES_MIN, choose::TILES_MAX)
+}
+
+/// How many tiles fit into so many bytes on the GPU, where they lie in whole rows, and beyond one sheet in whole sheets.
+fn capacity_on_gpu(bytes: u64, coding: Coding) -> usize {
+    let tiles = usize::try_from(bytes).unwrap_or(usize::MAX) / coding.tile_bytes();
+    let whole = if tiles < ROW * SHEET_ROWS { ROW } else { ROW * SHEET_ROWS };
+    (tiles - tiles % whole).clamp(TILES_MIN, choose::TILES_MAX)
+}
+
+/// The sheets on the GPU that hold so many tiles: rows of each, and how many.
+#[must_use]
+pub fn sheets(capacity: usize) -> [usize; 2] {
+    let rows = capacity.div_ceil(ROW).max(1);
+    [rows.min(SHEET_ROWS), rows.div_ceil(SHEET_ROWS)]
+}
+
+/// Bytes of GPU memory that the pictures of so many tiles take, shown or not.
+#[must_use]
+pub fn gpu_bytes(capacity: usize, coding: Coding) -> u64 {
+    let [rows, sheets] = sheets(capacity);
+    (rows * ROW * sheets * coding.tile_bytes()) as u64
 }
 
 #[derive(Debug)]
@@ -87,6 +117,9 @@ pub struct Draping {
     texture: Arc<Texture>,
     /// Once it has come.
     coverage: Option<Coverage>,
+    /// Tiles that memory has room for.
+    capacity_here: usize,
+    /// The same, as far as the GPU has room for them, too.
     capacity: usize,
     coding: Coding,
     frame: u64,
@@ -130,6 +163,7 @@ impl Draping {
             number,
             texture: Arc::new(texture.clone()),
             coverage: None,
+            capacity_here: capacity(bytes, coding),
             capacity: capacity(bytes, coding),
             coding,
             frame: 0,
@@ -151,6 +185,17 @@ impl Draping {
     #[must_use]
     pub fn texture(&self) -> &Texture {
         &self.texture
+    }
+
+    /// Shows no more tiles than fit into so many bytes of the GPU's memory, though [`TILES_MIN`] in any case.
+    pub fn fit_gpu(&mut self, bytes: u64) {
+        self.capacity = self.capacity_here.min(capacity_on_gpu(bytes, self.coding));
+    }
+
+    /// Bytes of GPU memory that its pictures take, once the first is shown.
+    #[must_use]
+    pub fn gpu_bytes(&self) -> u64 {
+        gpu_bytes(self.capacity, self.coding)
     }
 
     /// Tiles in memory.

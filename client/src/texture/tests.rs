@@ -132,6 +132,25 @@ fn hold(bytes: usize, coding: Coding, most: usize) {
     assert!(largest >= most.min(21), "{largest} tiles of {most}");
 }
 
+/// With less room on the GPU fewer are shown, and what is shown no more goes from memory, too.
+#[test]
+fn fewer_tiles_are_shown_where_the_gpu_has_no_room_for_more() {
+    let (texture, coverage) = texture();
+    let tile = Coding::Plain.tile_bytes();
+    let mut draping = Draping::start(0, &texture, 100 * tile, Coding::Plain, 0.0).unwrap();
+    draping.set_coverage(coverage);
+    let camera = Camera { size: [1600, 1200], ..above(2500.0, 200.0, 1200.0) };
+    let shown = |draping: &mut Draping| settle(draping, &camera).drape.unwrap().tiles.len();
+    let all = shown(&mut draping);
+    draping.fit_gpu(25 * tile as u64);
+    let few = shown(&mut draping);
+    assert!(all > 24 && few <= 24 && draping.tiles() <= 24, "{all} {few}");
+    assert_eq!(draping.gpu_bytes(), 24 * tile as u64);
+    draping.fit_gpu(u64::MAX);
+    assert_eq!(shown(&mut draping), all);
+    assert_eq!(draping.gpu_bytes(), 128 * tile as u64, "whole sheets");
+}
+
 #[test]
 fn tiles_fade_in_and_damaged_ones_are_told() {
     let (texture, coverage) = texture();

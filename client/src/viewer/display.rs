@@ -140,10 +140,22 @@ impl Display {
         }
     }
 
+    /// Tells the viewer what is left of the GPU's memory for the next frame.
+    fn count_room(&mut self, viewer: &mut Viewer) {
+        // As many pictures as may wait to be shown, and the one that is.
+        let images = u64::from(self.configuration.desired_maximum_frame_latency) + 1;
+        self.renderer.count_targets(4 * images, self.overlay.bytes());
+        let layers = &viewer.terrain().scene().layers;
+        let size = [self.configuration.width, self.configuration.height];
+        let taken = self.renderer.frame_bytes(layers, size, viewer.look(), viewer.terrain().waters());
+        viewer.set_gpu_taken(taken);
+    }
+
     /// Draws a frame, with the panel or, for a picture, without; how long until the next is wanted.
     pub(crate) fn draw(&mut self, viewer: &mut Viewer, with_panel: bool) -> Duration {
         viewer.resize([self.configuration.width, self.configuration.height]);
         viewer.suit_blocks(self.suits_blocks);
+        self.count_room(viewer);
         let input = self.input.take_egui_input(&self.window);
         let context = self.input.egui_ctx().clone();
         let mut output = context.run_ui(input, |ui| viewer.frame_of(ui, with_panel));

@@ -135,6 +135,8 @@ pub struct Viewer {
     grabbed: Option<DVec3>,
     /// The last two places that were clicked.
     marks: Vec<Mark>,
+    /// Those before the last click, which may turn out to be the first half of a double click.
+    marks_before: Vec<Mark>,
     profile: Profile,
     globe: Option<Globe>,
     bookmarks: Bookmarks,
@@ -181,6 +183,7 @@ impl Viewer {
             frozen: None,
             grabbed: None,
             marks: Vec::new(),
+            marks_before: Vec::new(),
             profile: Profile::default(),
             globe,
             bookmarks: Bookmarks::default(),
@@ -226,6 +229,11 @@ impl Viewer {
     /// See [`Terrain::suit_blocks`].
     pub fn suit_blocks(&mut self, suits: bool) {
         self.terrain.suit_blocks(suits);
+    }
+
+    /// See [`Terrain::set_gpu_taken`].
+    pub fn set_gpu_taken(&mut self, bytes: u64) {
+        self.terrain.set_gpu_taken(bytes);
     }
 
     /// What the last frame shows.
@@ -389,7 +397,7 @@ impl Viewer {
 
     /// Forgets what was of the version of the scene before: layers may be others now, and lie elsewhere.
     fn go_over(&mut self) {
-        self.marks.clear();
+        self.clear_marks();
         self.profile = Profile::default();
         self.globe = Globe::of(&self.terrain.scene().frame);
     }
@@ -459,11 +467,14 @@ impl Viewer {
             let (scroll, pinch) = ui.input(|input| (input.smooth_scroll_delta().y, input.zoom_delta()));
             self.zoom(pixel(at), (-f64::from(scroll) * ZOOM_PER_POINT).exp() / f64::from(pinch), nearest);
         }
-        if response.double_clicked()
-            && let Some(hit) = pointer.and_then(|at| self.pick(pixel(at)))
-        {
-            self.controls.glide_near(hit.point, nearest);
+        if response.double_clicked() {
+            // Its first half was no mark.
+            self.marks.clone_from(&self.marks_before);
+            if let Some(hit) = pointer.and_then(|at| self.pick(pixel(at))) {
+                self.controls.glide_near(hit.point, nearest);
+            }
         } else if response.clicked()
+            && !response.triple_clicked()
             && let Some(hit) = pointer.and_then(|at| self.pick(pixel(at)))
         {
             self.mark(&hit);
@@ -482,10 +493,16 @@ impl Viewer {
         }
     }
 
+    fn clear_marks(&mut self) {
+        self.marks.clear();
+        self.marks_before.clear();
+    }
+
     fn mark(&mut self, hit: &Hit) {
         let error = self.terrain.error_metres(hit.layer, hit.diamond, hit.side);
         let place = hit.point.with_z(hit.point.z / self.look.exaggeration);
         let lonlat = self.globe.as_ref().and_then(|globe| globe.lonlat(place));
+        self.marks_before.clone_from(&self.marks);
         self.marks.push(Mark { place, lonlat, error, layer: hit.layer });
         if self.marks.len() > 2 {
             self.marks.remove(0);
@@ -553,7 +570,7 @@ impl Viewer {
             self.play();
         }
         if pressed(Key::Escape) {
-            self.marks.clear();
+            self.clear_marks();
             self.message = None;
         }
         let is_quit = |event: &Event| matches!(event, Event::Key { key: Key::Q, pressed: true, modifiers, .. } if modifiers.command);

@@ -335,8 +335,9 @@ fn figures(viewer: &Viewer, ui: &mut Ui) {
     if stats.texture_tiles > 0 {
         row("imagery", format!("{} tiles, {:.0} MB", stats.texture_tiles, stats.texture_bytes as f64 / 1e6));
     }
-    let [surfaces, fixed] = [viewer.drawn.gpu_bytes, viewer.drawn.fixed_bytes].map(|b| b as f64 / 1e6);
-    row("graphics memory", format!("{surfaces:.0} + {fixed:.0} MB"));
+    let graphics = [viewer.drawn.total_bytes(), viewer.terrain.gpu_budget()];
+    let [taken, budget] = graphics.map(|b| b as f64 / 1e6);
+    row("graphics memory", format!("{taken:.0} of {budget:.0} MB"));
     if stats.traffic.disk_blobs > 0 {
         row("fetched before", format!("{:.2} MB", stats.traffic.disk_bytes as f64 / 1e6));
     }
@@ -350,7 +351,12 @@ fn figures(viewer: &Viewer, ui: &mut Ui) {
     } else if let Some(problem) = viewer.terrain.problem() {
         ui.colored_label(warning, problem);
     }
-    if frame.limited {
+    if graphics[0] > graphics[1] {
+        ui.colored_label(
+            warning,
+            "A window of this size needs more graphics memory than --gpu-memory gives.",
+        );
+    } else if frame.limited {
         ui.colored_label(warning, "There is no memory for less error.");
     }
     if viewer.terrain.scene_changed() {

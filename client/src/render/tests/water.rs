@@ -9,17 +9,17 @@ fn light(byte: u8) -> f64 {
     if c <= 0.040_45 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
 }
 
-const CALM: Water = PLAIN.water;
+pub(super) const CALM: Water = PLAIN.water;
 
 /// Land and water over the same forest; water level at a height in metres.
-struct Shore {
-    layers: [Layer; 2],
-    items: Vec<DrawItem>,
-    land: World,
+pub(super) struct Shore {
+    pub(super) layers: [Layer; 2],
+    pub(super) items: Vec<DrawItem>,
+    pub(super) land: World,
 }
 
 impl Shore {
-    fn new(level_metres: f64, height: impl Fn(u32, u32) -> i32) -> Self {
+    pub(super) fn new(level_metres: f64, height: impl Fn(u32, u32) -> i32) -> Self {
         let forest = Forest::new(6, 4, [1, 1]).unwrap();
         let land = World::new(forest, 10.0, height);
         let mut water = World::new(forest, 10.0, |_, _| (level_metres * 10.0) as i32);
@@ -320,4 +320,38 @@ fn a_coast_without_a_bed_has_no_corners() {
         ends.iter().max().unwrap() - ends.iter().min().unwrap()
     });
     assert!(cornered >= 4 && 3 * smooth < 2 * cornered, "{smooth} of {cornered} pixels");
+}
+
+/// Water that has no heights where it is dry looks as water that has them everywhere, which the ground hides: it runs on under the
+/// shore. Where it is drawn plain, it ends with its samples.
+#[test]
+fn water_that_ends_where_it_is_dry_has_the_shore_of_the_ground() {
+    let land = |x: u32, y: u32| rough(x, y) / 8 - 130;
+    let shore = Shore::new(12.0, land);
+    let forest = shore.land.layer.forest;
+    let mut wet = World::new(forest, 10.0, |x, y| if land(x, y) > 120 { NODATA } else { 120 });
+    wet.layer = shore.layers[1].clone();
+    let finest = forest.levels();
+    let ending: Vec<DrawItem> = shore
+        .land_items()
+        .into_iter()
+        .chain(wet.level(finest).into_iter().map(|item| DrawItem { layer: 1, ..item }))
+        .collect();
+    for (x, z) in [(0.5, 150.0), (0.2, 60.0)] {
+        let camera = Camera {
+            eye: shore.land.place(x, -0.2, z),
+            target: shore.land.place(0.5, 0.5, 12.0),
+            fov_y: 0.8,
+            size: [320, 240],
+        };
+        let differs = |look: &Look| {
+            let [a, b] = [&shore.items, &ending].map(|items| shore.picture(&camera, items, look, 1));
+            let pixels = a.pixels.chunks(4).zip(b.pixels.chunks(4));
+            pixels.filter(|(a, b)| a.iter().zip(b.iter()).any(|(a, b)| a.abs_diff(*b) > 8)).count()
+        };
+        let mirroring = differs(&Look { water: CALM, ..PLAIN });
+        let plain = differs(&Look { water: Water { reflecting: false, ..CALM }, ..PLAIN });
+        println!("{mirroring} pixels differ, {plain} where water is drawn plain");
+        assert!(plain > 200 && mirroring < plain / 20, "{mirroring} {plain}");
+    }
 }

@@ -150,3 +150,28 @@ fn what_is_drawn_stays_within_the_gpu_whatever_has_arrived_and_moves() {
         assert!(taken <= gpu_bytes && taken > gpu_bytes / 5, "{taken} of {gpu_bytes}");
     }
 }
+
+/// What frames take comes first, then imagery, then diamonds.
+#[test]
+fn the_gpu_is_shared_by_frames_imagery_and_diamonds() {
+    let served = Served::start_draped();
+    let gpu_bytes = 90 << 20;
+    let mut terrain = open(&served, Options { gpu_bytes, ..Options::default() });
+    let shares = |terrain: &Terrain| [terrain.imagery_gpu_bytes(), terrain.layers[0].gpu_bytes];
+    // A third is less than two sheets of 16 MiB.
+    let [imagery, diamonds] = shares(&terrain);
+    assert_eq!((imagery, diamonds), (16 << 20, (74 << 20) - (74 << 20) / 64));
+    terrain.set_gpu_taken(60 << 20);
+    let [imagery, diamonds] = shares(&terrain);
+    assert_eq!((imagery, diamonds), (10 << 20, (20 << 20) - (20 << 20) / 64));
+    terrain.set_gpu_taken(87 << 20);
+    let [imagery, diamonds] = shares(&terrain);
+    assert_eq!((imagery, diamonds), (4 << 20, 0), "the fewest tiles, and no more than the coarsest diamonds");
+    assert_eq!(terrain.gpu_least(), 91 << 20);
+    terrain.set_texture(None);
+    assert_eq!(shares(&terrain), [0, (3 << 20) - (3 << 20) / 64]);
+    assert_eq!(terrain.gpu_least(), 87 << 20);
+    terrain.set_gpu_taken(0);
+    terrain.set_texture(Some(0));
+    assert_eq!(shares(&terrain)[0], 16 << 20);
+}

@@ -93,6 +93,34 @@ fn a_double_click_flies_there() {
     assert!((hand.camera().eye - point).length() < 0.5 * (before.eye - point).length());
 }
 
+/// The places that are measured stay as they were, whatever was clicked before.
+#[test]
+fn a_double_click_marks_nothing() {
+    let mut hand = Hand::new(Some(looking_down()));
+    let [a, b] = hand.solid();
+    let twice = |hand: &mut Hand, at: Pos2| {
+        hand.seconds += 5.0;
+        hand.click(at);
+        hand.click(at);
+        assert!(hand.viewer.controls.is_gliding());
+        // It does not go on, so that places stay where they are seen.
+        hand.viewer.controls = Controls::new(hand.camera());
+    };
+    twice(&mut hand, a);
+    assert!(hand.viewer.marks().is_empty(), "{:?}", hand.viewer.marks());
+    for at in [a, b] {
+        hand.seconds += 5.0;
+        hand.click(at);
+    }
+    let marks = hand.viewer.marks().to_vec();
+    assert_eq!(marks.len(), 2);
+    let [c, _] = hand.solid();
+    twice(&mut hand, c);
+    assert_eq!(hand.viewer.marks(), marks);
+    twice(&mut hand, c);
+    assert_eq!(hand.viewer.marks(), marks, "nor the next one");
+}
+
 #[test]
 fn two_fingers_turn_what_is_between_them() {
     let mut hand = Hand::new(None);
