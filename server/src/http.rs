@@ -294,7 +294,10 @@ async fn aside(look: impl FnOnce() + Send + 'static) {
 async fn watch_scene(site: Arc<Site>, name: String, limits: Limits) {
     let grace = Duration::from_secs(limits.grace.into());
     let mut ticks = ticks(&limits);
-    while limits.reload > 0 {
+    if limits.reload == 0 {
+        return;
+    }
+    loop {
         ticks.tick().await;
         let Some(store) = site.scenes.newest(&name) else { return };
         let site = Arc::clone(&site);
