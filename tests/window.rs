@@ -30,7 +30,8 @@ struct Screen {
 impl Screen {
     fn start() -> Self {
         let mut command = Command::new("Xvfb");
-        command.args(["-displayfd", "1", "-screen", "0", "1000x700x24", "-nolisten", "tcp"]);
+        // Else it begins anew whenever a client has left it alone, and refuses who comes just then.
+        command.args(["-displayfd", "1", "-screen", "0", "1000x700x24", "-nolisten", "tcp", "-noreset"]);
         let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap_or_else(|e| {
             panic!("Xvfb: {e}; install the packages that scripts/setup names (xvfb, xdotool, x11-apps)")
         });
