@@ -520,6 +520,21 @@ impl Serving {
     }
 }
 
+/// Imagery of no tiles.
+pub(crate) fn photo() -> Texture {
+    Texture {
+        name: "photo".to_owned(),
+        origin: [0.0, 0.0],
+        texel: [10.0, 10.0],
+        size: [1024, 512],
+        format: "webp".to_owned(),
+        quality: 80,
+        tiles: 0,
+        bytes: 0,
+        resampled: false,
+    }
+}
+
 impl Served {
     pub(crate) fn start(layers: usize, faults: Faults) -> Self {
         Self::start_at("127.0.0.1:0", layers, faults)
@@ -532,18 +547,7 @@ impl Served {
 
     /// Terrain and imagery of it, none of whose tiles there are.
     pub(crate) fn start_draped() -> Self {
-        let photo = Texture {
-            name: "photo".to_owned(),
-            origin: [0.0, 0.0],
-            texel: [10.0, 10.0],
-            size: [1024, 512],
-            format: "webp".to_owned(),
-            quality: 80,
-            tiles: 0,
-            bytes: 0,
-            resampled: false,
-        };
-        Self::start_with("127.0.0.1:0", Scene { textures: vec![photo], ..scene(1) }, Faults::default())
+        Self::start_with("127.0.0.1:0", Scene { textures: vec![photo()], ..scene(1) }, Faults::default())
     }
 
     fn start_with(address: &str, scene: Scene, faults: Faults) -> Self {

@@ -1,7 +1,8 @@
 //! Pipelines: how vertices of each kind become pixels of each pass.
 
+use super::DEPTH;
+use super::lens::Instance;
 use super::resident::SurfacePoint;
-use super::{DEPTH, Instance};
 use crate::morph::Record;
 use crate::surface::Corner;
 

@@ -7,6 +7,7 @@ use super::drape::Drapes;
 use super::water::WaterPasses;
 use super::{Look, Renderer};
 use crate::surface::triangles::Form;
+use diamantina_protocol::bintree::Forest;
 use diamantina_protocol::message::Layer;
 use std::collections::HashSet;
 
@@ -15,13 +16,17 @@ pub(super) fn pixels(size: [u32; 2]) -> u64 {
     size.map(u64::from).iter().product()
 }
 
+/// Bytes that the samples of a pixel take: of each four of depth and, where there are several, as many of colour.
+pub(super) fn samples_bytes(samples: u32) -> u64 {
+    u64::from(samples) * if samples > 1 { 8 } else { 4 }
+}
+
 /// Index lists that all diamonds of these layers share, once diamonds of all levels are drawn.
 fn shared_bytes(layers: &[Layer], wires: bool) -> u64 {
-    let forms = |layer: &Layer| {
-        let forest = layer.forest;
-        (0..forest.levels()).map(move |level| Form::at(&forest, level))
-    };
-    let forms: HashSet<Form> = layers.iter().flat_map(forms).collect();
+    // The steps of a series, of which there may be hundreds, have one.
+    let forests = layers.chunk_by(|a, b| a.forest == b.forest).map(|alike| alike[0].forest);
+    let forms = |forest: Forest| (0..forest.levels()).map(move |level| Form::at(&forest, level));
+    let forms: HashSet<Form> = forests.flat_map(forms).collect();
     forms.into_iter().map(|form| form.gpu_bytes(wires)).sum()
 }
 
@@ -32,11 +37,9 @@ impl Renderer {
     #[must_use]
     pub fn frame_bytes(&self, layers: &[Layer], size: [u32; 2], look: &Look, waters: usize) -> u64 {
         let samples = self.options.samples;
-        // Depth, and as much of colour where there are several samples.
-        let of_picture = u64::from(samples) * if samples > 1 { 8 } else { 4 };
         let waters = if look.mirrors() { waters } else { 0 };
         let held = self.water.as_ref().map_or(0, WaterPasses::bytes);
-        pixels(size) * (of_picture + self.target_bytes)
+        pixels(size) * (samples_bytes(samples) + self.target_bytes)
             + held.max(WaterPasses::bytes_of(size, look, samples, waters))
             + Drapes::least_bytes()
             + shared_bytes(layers, look.wireframe).max(self.residents.shared_bytes())

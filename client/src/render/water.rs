@@ -10,10 +10,11 @@
 //! one (see [`Renderer::mirror`]), else from the diamonds of the picture.
 
 use super::frame::single;
+use super::lens::Lens;
 use super::pipelines::{Mode, Pipelines, Target, sky_pipeline, terrain_pipelines};
-use super::room::pixels;
+use super::room::{pixels, samples_bytes};
 use super::view::View;
-use super::{DEPTH, Draw, FrameStats, Lens, Look, Renderer, What, clear_colour, is_water};
+use super::{DEPTH, Draw, FrameStats, Look, Renderer, What, clear_colour, is_water};
 use crate::camera::Camera;
 use crate::drawing::DrawItem;
 use crate::mirror::mean_height;
@@ -138,10 +139,9 @@ impl Sheet {
     }
 }
 
-/// Bytes of GPU memory: four a pixel of colour, and of each sample four of depth and, where there are several, of colour.
+/// Bytes of GPU memory: four a pixel of colour, and its samples.
 fn sheet_bytes(size: [u32; 2], samples: u32) -> u64 {
-    let of_samples = u64::from(samples) * if samples > 1 { 8 } else { 4 };
-    pixels(size) * (4 + of_samples)
+    pixels(size) * (4 + samples_bytes(samples))
 }
 
 /// The size of what is mirrored in pictures of a size.

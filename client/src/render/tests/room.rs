@@ -4,22 +4,11 @@ use super::water::{CALM, Shore};
 use super::*;
 use crate::render::Water;
 use crate::texture::{self, Coding};
-use diamantina_protocol::texture::Texture;
+use crate::world::photo;
 
 /// Imagery of no tiles yet, and with room for so many.
 fn drape(capacity: usize) -> Drape {
-    let texture = Texture {
-        name: "photo".to_owned(),
-        origin: [0.0, 0.0],
-        texel: [10.0, 10.0],
-        size: [1024, 512],
-        format: "webp".to_owned(),
-        quality: 80,
-        tiles: 0,
-        bytes: 0,
-        resampled: false,
-    };
-    Drape { texture: Arc::new(texture), tiles: Vec::new(), capacity, coding: Coding::Plain }
+    Drape { texture: Arc::new(photo()), tiles: Vec::new(), capacity, coding: Coding::Plain }
 }
 
 /// Bytes that the driver was asked for, as far as it tells: without what wgpu takes for itself.
